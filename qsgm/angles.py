@@ -1,0 +1,53 @@
+"""Grasp angles: modulo 180 degrees, counter-clockwise positive as seen in the image.
+
+A two-finger gripper cannot tell an angle from its opposite, so an angle is a line's direction.
+The double angle (sin 2θ, cos 2θ) has no seam anywhere; the paper's (sin θ, cos θ) with
+θ in (-π/2, π/2] breaks at ±90° (design finding 2) and is kept for the paper's tables.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+AngleEncoding = Literal["double", "paper"]
+Floats = NDArray[np.float32] | NDArray[np.float64]
+
+
+def wrap_half_turn(angle_rad: Floats) -> NDArray[np.float64]:
+    """Any angles [rad] mapped to (-π/2, π/2]."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    wrapped = np.pi / 2 - np.mod(np.pi / 2 - angle, np.pi)
+    # A tiny negative argument makes `mod` round up to π itself.
+    return np.where(wrapped <= -np.pi / 2, np.pi / 2, wrapped)
+
+
+def encode_angle(angle_rad: Floats, encoding: AngleEncoding = "double") -> NDArray[np.float32]:
+    """Angles [rad], shape (N,), as their two label channels (sine, cosine), shape (N, 2)."""
+    factor = 2.0 if encoding == "double" else 1.0
+    angle = factor * wrap_half_turn(angle_rad)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1).astype(np.float32)
+
+
+def decode_angle(
+    sine: Floats, cosine: Floats, encoding: AngleEncoding = "double"
+) -> NDArray[np.float64]:
+    """Label channels back to angles [rad] in (-π/2, π/2]; the inverse of :func:`encode_angle`."""
+    factor = 2.0 if encoding == "double" else 1.0
+    return wrap_half_turn(np.arctan2(np.asarray(sine), np.asarray(cosine)) / factor)
+
+
+def angle_error(predicted_rad: Floats, true_rad: Floats) -> NDArray[np.float64]:
+    """Absolute difference of line directions [rad], in [0, π/2]."""
+    return np.abs(wrap_half_turn(np.asarray(predicted_rad) - np.asarray(true_rad)))
+
+
+def mean_direction(angle_rad: Floats) -> tuple[float, float]:
+    """Circular mean of line directions [rad] and its strength in [0, 1].
+
+    The strength is the mean resultant length of the doubled angles: 1 when all agree,
+    near 0 when there is no common direction (a round object).
+    """
+    resultant = np.mean(np.exp(2j * np.asarray(angle_rad, dtype=np.float64)))
+    mean = wrap_half_turn(np.asarray(np.angle(resultant) / 2))
+    return float(mean), float(np.abs(resultant))

@@ -1,0 +1,1 @@
+"""The host side: drawing, pretraining, folding, quantizing, exporting. Needs the extra `train`."""

@@ -1,0 +1,11 @@
+"""ONNX graphs of everything the device runs, in standard operators only.
+
+build      a graph, operator by operator
+trunk      crops to the frozen layers' features; image frames to heatmaps (also layer by layer)
+layers     one tuned layer: forward, back through its activation, weight gradient; the loss
+sgm        a static SGM in float and in int8
+optimizers SGD with momentum and Adam, one parameter at a time
+step       a whole training step, layer-local or by backpropagation
+probe      the gradients that an SGM should give, and gives in float and int8; bare outputs
+inspection which operators ONNX Runtime makes of a graph
+"""

@@ -1,0 +1,96 @@
+"""Optimizers in a graph: one parameter's update at a time.
+
+An optimizer names the moments it keeps of every parameter, all of which start at zero, and makes
+the rule that updates one parameter. Whatever the steps share is declared once, by `rule`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from onnx import TensorProto
+
+from qsgm.train.graphs.build import Graph, Ops, Value
+
+# (operators, value, its moments, gradient, rate) -> next value, next moments
+Rule = Callable[[Ops, Value, Sequence[Value], Value, Value], tuple[Value, Sequence[Value]]]
+
+
+class Optimizer(Protocol):
+    """What a step graph asks of its optimizer."""
+
+    @property
+    def moments(self) -> tuple[str, ...]:
+        """What is kept of each parameter, as in `weight_<moment>4`."""
+        ...
+
+    def rule(self, graph: Graph) -> Rule:
+        """Declare what all parameters share, and return the update of one of them."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sgd:
+    """SGD with momentum, without dampening, as torch has it."""
+
+    momentum: float = 0.9
+
+    @property
+    def moments(self) -> tuple[str, ...]:
+        return ("momentum",)
+
+    def rule(self, graph: Graph) -> Rule:
+        decay = graph.constant(self.momentum)
+
+        def update(
+            op: Ops, value: Value, moments: Sequence[Value], gradient: Value, rate: Value
+        ) -> tuple[Value, Sequence[Value]]:
+            momentum = op.Add(op.Mul(moments[0], decay), gradient)
+            return op.Sub(value, op.Mul(rate, momentum)), (momentum,)
+
+        return update
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam as torch has it. `step`, an int64 that starts at zero, counts the steps done so far."""
+
+    mean_decay: float = 0.9
+    square_decay: float = 0.999
+    epsilon: float = 1e-8
+
+    @property
+    def moments(self) -> tuple[str, ...]:
+        return ("mean", "square")
+
+    def rule(self, graph: Graph) -> Rule:
+        op = graph.within("adam")
+        step = op.Add(graph.input("step", np.int64, ()), op.constant(1, np.int64))
+        graph.output("step_next", step, np.int64, ())
+        mean_correction = _correction(op, self.mean_decay, step)
+        square_correction = op.Sqrt(_correction(op, self.square_decay, step))
+
+        def update(
+            op: Ops, value: Value, moments: Sequence[Value], gradient: Value, rate: Value
+        ) -> tuple[Value, Sequence[Value]]:
+            mean = _decayed(op, moments[0], gradient, self.mean_decay)
+            square = _decayed(op, moments[1], op.Mul(gradient, gradient), self.square_decay)
+            root = op.Div(op.Sqrt(square), square_correction)
+            direction = op.Div(mean, op.Add(root, op.constant(self.epsilon)))
+            step_size = op.Div(rate, mean_correction)
+            return op.Sub(value, op.Mul(step_size, direction)), (mean, square)
+
+        return update
+
+
+def _decayed(op: Ops, moment: Value, new: Value, decay: float) -> Value:
+    """The running average after one more value."""
+    return op.Add(op.Mul(moment, op.constant(decay)), op.Mul(new, op.constant(1 - decay)))
+
+
+def _correction(op: Ops, decay: float, step: Value) -> Value:
+    """1 - decay^step, a float32 scalar: what a running average that began at zero has to gain."""
+    # In double: in float32, 1 - 0.999 is already wrong in its fourth digit.
+    power = op.Pow(op.constant(decay, np.float64), op.Cast(step, to=TensorProto.DOUBLE))
+    return op.Cast(op.Sub(op.constant(1.0, np.float64), power), to=TensorProto.FLOAT)

@@ -1,0 +1,11 @@
+"""The families of objects that can be drawn, by kind.
+
+A builder turns random numbers and a Brush into a shape: a list of parts in painting order.
+"""
+
+from qsgm.train.goods import COMPACT_GOODS, ELONGATED_GOODS
+from qsgm.train.parts import Builder
+from qsgm.train.tools import TOOLS
+
+ELONGATED: dict[str, Builder] = ELONGATED_GOODS | TOOLS
+COMPACT: dict[str, Builder] = COMPACT_GOODS

@@ -1,0 +1,100 @@
+"""Drawn frames as training data: a stream of labelled crops, and tasks for meta-training.
+
+A task is one object, as the device will meet it: a demonstration frame, crops of it, features of
+the frozen layers, and labels aligned with the network's own idea of the object's axis.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from qsgm.angles import decode_angle, mean_direction, wrap_half_turn
+from qsgm.crops import CropPlan, cut_crops, label_crops, plan_crops
+from qsgm.train.graspnet import LAYERS, GraspNet, Loss, normalize
+from qsgm.train.objects import draw_frame
+
+CENTER_PX = (320.0, 240.0)
+FRAME_HW = (480, 640)
+# Rounder than this, a drawn object has no axis worth learning: both angle labels are 0.
+LEAST_ELONGATION = 1.25
+
+
+class CropStream(Dataset[tuple[Tensor, Tensor]]):
+    """Item i: crops (n, 128, 128, 3) uint8 of the i-th drawn frame and labels (n, 3)."""
+
+    def __init__(self, seed: int, frames: int, crops_per_frame: int) -> None:
+        self.seed, self.frames, self.crops_per_frame = seed, frames, crops_per_frame
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
+        cv2.setNumThreads(1)  # one loader process a core
+        rng = np.random.default_rng((self.seed, i))
+        drawn = draw_frame(rng)
+        plan = plan_crops(FRAME_HW, CENTER_PX, rng, self.crops_per_frame)
+        labels = label_crops(plan, drawn.axis_rad)
+        if drawn.elongation < LEAST_ELONGATION:
+            labels[:, 1:] = 0.0
+        return torch.from_numpy(cut_crops(drawn.image, plan)), torch.from_numpy(labels)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One object: features (N, P, C) of the frozen layers, position-major, and labels (N, 3)."""
+
+    features: Tensor
+    labels: Tensor
+    offset_rad: float
+
+
+@torch.no_grad()
+def features_of(
+    net: GraspNet, crops: NDArray[np.uint8], last_frozen: int, chunk: int = 100
+) -> Tensor:
+    """Crops (N, 128, 128, 3) to features (N, P, C) behind layer `last_frozen`."""
+    parts = []
+    for start in range(0, len(crops), chunk):
+        x = normalize(torch.from_numpy(crops[start : start + chunk]))
+        parts.append(net.between(x, 1, last_frozen).flatten(2).transpose(1, 2).contiguous())
+    return torch.cat(parts)
+
+
+@torch.no_grad()
+def axis_offset(raw: Tensor, plan: CropPlan, loss: Loss) -> float:
+    """The demonstration's own orientation [rad] as the untouched network sees it.
+
+    Args:
+        raw: (N, 3) raw outputs for all crops of the plan.
+    """
+    positive = plan.quality > 0
+    seen = loss.activate(raw)[torch.from_numpy(positive)].numpy()
+    predicted = decode_angle(seen[:, 1], seen[:, 2], loss.encoding)
+    return mean_direction(wrap_half_turn(predicted - plan.turn_rad[positive]))[0]
+
+
+@torch.no_grad()
+def make_task(
+    net: GraspNet,
+    frame: NDArray[np.uint8],
+    rng: np.random.Generator,
+    *,
+    last_frozen: int,
+    count: int,
+    loss: Loss,
+    center_px: tuple[float, float] = CENTER_PX,
+) -> Task:
+    """Cut, label and featurize the crops of one demonstration with the untouched network."""
+    height, width = frame.shape[:2]
+    plan = plan_crops((height, width), center_px, rng, count)
+    features = features_of(net, cut_crops(frame, plan), last_frozen)
+    side = int(features.shape[1] ** 0.5)
+    maps = features.transpose(1, 2).unflatten(2, (side, side))
+    raw = net.between(maps, last_frozen + 1, LAYERS)[:, :, 0, 0]
+    offset = axis_offset(raw, plan, loss)
+    return Task(features, torch.from_numpy(label_crops(plan, offset, loss.encoding)), offset)

@@ -1,0 +1,101 @@
+"""The inner loop: run a training step's graph over batches, state in and state out.
+
+State lives in two sets of buffers that swap roles every step (ping-pong): what one step writes
+the next one reads, nothing is copied or allocated, and no buffer is read and written in the same
+step, which ONNX Runtime does not promise to be safe.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+NEXT = "_next"
+BATCH = 32
+
+
+class StepLoop:
+    """A training step bound to its data and its state."""
+
+    def __init__(
+        self,
+        session: ort.InferenceSession,
+        features: Array,  # (N, P, C), input of the first tuned layer
+        labels: Array,  # (N, 3)
+        last_error: Array,  # (N, 3), d loss / d output when the crop was last seen
+        weights: Mapping[str, Array],  # weight{k}: (Co, K), bias{k}: (Co,)
+        rates: Mapping[int, float],  # per tuned layer
+    ) -> None:
+        self._session = session
+        self._last_error = np.array(last_error, dtype=np.float32)
+        self._names = [o.name for o in session.get_outputs() if o.name.endswith(NEXT)]
+        shapes = {i.name: i.shape for i in session.get_inputs()}
+        start = {
+            name: np.array(weights[name]) if name in weights else np.zeros(shapes[name], np.float32)
+            for name in (n.removesuffix(NEXT) for n in self._names)
+        }
+        self._state = [_buffers(start), _buffers(start)]
+        fixed = {"features": features, "labels": labels, "last_error": self._last_error}
+        fixed |= {f"rate{k}": np.float32(rate).reshape(()) for k, rate in rates.items()}
+        self._fixed = {k: np.ascontiguousarray(v) for k, v in fixed.items() if k in shapes}
+        self._bindings = [self._bind(0, 1), self._bind(1, 0)]
+        self._now = 0
+
+    def step(self, rows: NDArray[np.int64]) -> float:
+        """Train on the crops `rows`; returns the batch's mean loss before the update."""
+        binding = self._bindings[self._now]
+        binding.bind_cpu_input("rows", rows)
+        self._session.run_with_iobinding(binding)
+        error, loss = binding.get_outputs()[-2:]
+        self._last_error[rows] = error.numpy()
+        self._now = 1 - self._now
+        return float(loss.numpy())
+
+    def weights(self) -> dict[str, Array]:
+        """A copy of the weights and biases as they are now."""
+        current = self._state[self._now]
+        return {n: v.numpy().copy() for n, v in current.items() if n.startswith(("weight", "bias"))
+                and "_" not in n}
+
+    @property
+    def last_error(self) -> Array:
+        """(N, 3); changes with every step."""
+        return self._last_error
+
+    def _bind(self, source: int, target: int) -> ort.IOBinding:
+        binding = self._session.io_binding()
+        for name, array in self._fixed.items():
+            binding.bind_cpu_input(name, array)
+        for name in self._names:
+            binding.bind_ortvalue_input(name.removesuffix(NEXT), self._state[source][name.removesuffix(NEXT)])
+            binding.bind_ortvalue_output(name, self._state[target][name.removesuffix(NEXT)])
+        for name in ("error", "loss"):
+            binding.bind_output(name, "cpu")
+        return binding
+
+
+def _buffers(arrays: Mapping[str, Array]) -> dict[str, ort.OrtValue]:
+    # An OrtValue shares the memory of the array it is made from, so every set gets its own copy.
+    return {name: ort.OrtValue.ortvalue_from_numpy(a.copy()) for name, a in arrays.items()}
+
+
+def batches(count: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+    """Rows of every batch of one epoch over `count` crops, shuffled; the last may be smaller."""
+    order = rng.permutation(count)
+    for start in range(0, count, BATCH):
+        yield order[start : start + BATCH]
+
+
+def tune(
+    loop: StepLoop,
+    count: int,
+    epochs: int,
+    rng: np.random.Generator,
+    after_epoch: Callable[[int, float], None],
+) -> None:
+    """Run `epochs` passes over the first `count` crops; `after_epoch` gets its number and loss."""
+    for epoch in range(1, epochs + 1):
+        losses = [loop.step(rows) for rows in batches(count, rng)]
+        after_epoch(epoch, float(np.mean(losses)))

@@ -1,0 +1,116 @@
+"""Folding leaves every function as it was, and refuses what it cannot fold."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from qsgm import QsgmError
+from qsgm.train.fold import fold_net, fold_sgm, net_fold_error, run_folded, sgm_fold_error
+from qsgm.train.graspnet import GraspNet, normalize
+from qsgm.train.sgm import Sgm
+
+
+def shake_norms(module: nn.Module, seed: int) -> None:
+    """Give every batchnorm statistics and weights far from where they start; set eval mode."""
+    generator = torch.Generator().manual_seed(seed)
+    for norm in module.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            size = norm.num_features
+            norm.running_mean = torch.randn(size, generator=generator)
+            norm.running_var = 0.05 + 3 * torch.rand(size, generator=generator)
+            norm.weight.data = torch.randn(size, generator=generator)
+            norm.bias.data = torch.randn(size, generator=generator)
+    module.eval()
+
+
+def shaken_net(seed: int) -> GraspNet:
+    torch.manual_seed(seed)
+    net = GraspNet()
+    shake_norms(net, seed)
+    return net
+
+
+def random_crops(seed: int, count: int = 4) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (count, 128, 128, 3), generator=generator, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_folded_network_on_raw_pixels_equals_the_unfolded_one(seed: int) -> None:
+    net, crops = shaken_net(seed), random_crops(seed)
+    with torch.no_grad():
+        expected = net(normalize(crops))
+        got = run_folded(fold_net(net), crops)
+    torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+    assert net_fold_error(net, fold_net(net), crops) == float((got - expected).abs().max())
+
+
+@pytest.mark.parametrize("layer", range(1, 6))
+@pytest.mark.parametrize("hidden", [None, 7])
+def test_folded_sgm_equals_the_unfolded_one(layer: int, hidden: int | None) -> None:
+    torch.manual_seed(layer)
+    sgm = Sgm(layer, hidden)
+    shake_norms(sgm, layer)
+    inputs = 3 * torch.randn(8, sgm.conv1.in_channels, 5, 5)
+    assert sgm_fold_error(sgm, fold_sgm(layer, sgm), inputs) < 1e-5
+
+
+def test_batchnorm_is_folded_with_its_running_statistics_even_in_training_mode() -> None:
+    net = shaken_net(0)
+    expected = fold_net(net)
+    net.train()
+    got = fold_net(net)
+    assert net.training
+    for one, other in zip(got.layers, expected.layers, strict=True):
+        np.testing.assert_array_equal(one.weight, other.weight)
+        np.testing.assert_array_equal(one.bias, other.bias)
+
+
+def test_parameter_counts_are_the_papers() -> None:
+    layers = [sum(p.numel() for p in layer.parameters()) for layer in GraspNet().layers]
+    sgms = [sum(p.numel() for p in Sgm(layer).parameters()) for layer in range(1, 6)]
+    assert layers == [624, 1624, 3248, 6448, 304, 51]
+    assert sgms == [1400, 1400, 5104, 624, 624]
+
+
+def test_folded_layers_keep_geometry_and_drop_two_numbers_per_channel() -> None:
+    folded = fold_net(GraspNet())
+    assert [layer.stride for layer in folded.layers] == [2, 2, 2, 2, 1, 1]
+    assert [layer.relu for layer in folded.layers] == [True] * 5 + [False]
+    assert [layer.pool for layer in folded.layers] == [1, 1, 1, 5, 1, 1]
+    sizes = [layer.weight.size + layer.bias.size for layer in folded.layers]
+    assert sizes == [624 - 16, 1624 - 16, 3248 - 32, 6448 - 32, 304 - 32, 51]
+    assert all(layer.weight.dtype == layer.bias.dtype == np.float32 for layer in folded.layers)
+
+
+def test_extra_channels_tell_whether_an_sgm_takes_the_last_error() -> None:
+    sgm = Sgm(4)
+    assert fold_sgm(4, sgm).extra_channels == 3
+    sgm.conv1 = nn.Conv2d(22, 16, 1)
+    assert fold_sgm(4, sgm).extra_channels == 6
+    sgm.conv1 = nn.Conv2d(20, 16, 1)
+    with pytest.raises(QsgmError, match="behind layer 4 has 4 input channels beside"):
+        fold_sgm(4, sgm)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_variance_that_is_not_finite_and_positive_is_refused(bad: float) -> None:
+    net = GraspNet()
+    net.layers[2].norm.running_var[3] = bad
+    with pytest.raises(QsgmError, match="layer 3: batchnorm's running statistics"):
+        fold_net(net)
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    net = GraspNet()
+    net.layers[5].conv.weight.data[0, 0] = float("nan")
+    with pytest.raises(QsgmError, match="layer 6 has weights that are not finite"):
+        fold_net(net)
+
+
+def test_a_batchnorm_that_no_convolution_can_absorb_is_refused() -> None:
+    net = GraspNet()
+    net.add_module("stray", nn.BatchNorm2d(3))
+    with pytest.raises(QsgmError, match="'stray' does not stand behind a convolution"):
+        fold_net(net)

@@ -1,0 +1,171 @@
+"""The differentiable training steps against autograd through plain torch convolutions."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from qsgm.train.graspnet import Loss
+from qsgm.train.local import LayerState, local_step, loss_gradient, outputs, true_gradients
+
+TASKS, BATCH = 3, 5
+SHAPES = {4: (16, 16, 5, 5), 5: (16, 16, 1, 1), 6: (3, 16, 1, 1)}
+RATES = {4: 0.1, 5: 0.2, 6: 0.3}
+LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=2.0)]
+
+Weights = dict[int, tuple[Tensor, Tensor]]  # per layer: (Co, Ci, kh, kw) and (Co,)
+
+
+def random_weights(tuned: int) -> list[Weights]:
+    """One set per task."""
+    torch.manual_seed(tuned)
+    return [
+        {
+            number: (torch.randn(shape) / 5, torch.randn(shape[0]) / 5)
+            for number, shape in SHAPES.items()
+            if number > 6 - tuned
+        }
+        for _ in range(TASKS)
+    ]
+
+
+def random_data(tuned: int) -> tuple[Tensor, Tensor]:
+    features = torch.randn(TASKS, BATCH, 169 if tuned == 3 else 1, 16).relu()
+    angle = torch.randn(TASKS, BATCH)
+    quality = (angle > -0.5).float()
+    return features, torch.stack([quality, angle.sin(), angle.cos()], dim=-1)
+
+
+def as_states(tasks: list[Weights]) -> list[LayerState]:
+    return [
+        LayerState.start(
+            torch.stack([task[number][0].permute(2, 3, 1, 0).flatten(0, 2) for task in tasks]),
+            torch.stack([task[number][1] for task in tasks]),
+        )
+        for number in tasks[0]
+    ]
+
+
+def plain_layer(number: int, weights: Weights, x: Tensor) -> Tensor:
+    x = F.conv2d(x, *weights[number], stride=2 if number == 4 else 1)
+    x = F.relu(x) if number < 6 else x
+    return F.avg_pool2d(x, 5) if number == 4 else x
+
+
+def as_map(features: Tensor) -> Tensor:
+    side = round(features.shape[1] ** 0.5)
+    return features.transpose(1, 2).unflatten(2, (side, side))
+
+
+def made_up_gradient(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
+    """Stands in for an SGM: anything that depends on layer, activation and label."""
+    return torch.sin(layer * activation) + labels[..., None, :1] - labels[..., None, 1:2]
+
+
+def flat_gradients(number: int, weights: Weights, objective: Tensor) -> tuple[Tensor, Tensor]:
+    weight, bias = torch.autograd.grad(objective, list(weights[number]))
+    return weight.permute(2, 3, 1, 0).flatten(0, 2), bias
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Threads that wait for each other on a busy machine take longer than this work does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> None:
+    tasks, (features, labels) = random_weights(tuned), random_data(tuned)
+    states = as_states(tasks)
+    loss = Loss()
+
+    def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
+        if layer == 6:
+            return loss_gradient(loss, activation, labels[:, :, None])
+        return made_up_gradient(layer, activation, labels)
+
+    rates = [torch.tensor(RATES[number]) for number in tasks[0]]
+    updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
+    twice = local_step(updated, features, labels, rates, gradient_of, momentum=0.9)
+    for task, weights in enumerate(tasks):
+        x = as_map(features[task])
+        for index, number in enumerate(weights):
+            for tensor in weights[number]:
+                tensor.requires_grad_()
+            x = plain_layer(number, weights, x.detach())
+            if number == 6:
+                objective = loss(x.flatten(1), labels[task])
+            else:
+                after = x.detach().flatten(1)[:, None]
+                injected = made_up_gradient(number, after, labels[task])[:, 0]
+                objective = (x.flatten(1) * injected).sum() / BATCH
+            weight, bias = flat_gradients(number, weights, objective)
+            before, once = states[index], updated[index]
+            moved = before.weight[task] - RATES[number] * weight
+            torch.testing.assert_close(once.weight[task], moved, atol=1e-5, rtol=1e-5)
+            moved = before.bias[task] - RATES[number] * bias
+            torch.testing.assert_close(once.bias[task], moved, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(once.weight_momentum[task], weight, atol=1e-5, rtol=1e-5)
+            # The second step moves by what its own momentum says, which remembers the first's.
+            moved = once.weight - RATES[number] * twice[index].weight_momentum
+            torch.testing.assert_close(twice[index].weight, moved)
+
+
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_outputs_equal_plain_convolutions(tuned: int) -> None:
+    tasks, (features, _) = random_weights(tuned), random_data(tuned)
+    got = outputs(as_states(tasks), features)
+    for task, weights in enumerate(tasks):
+        x = as_map(features[task])
+        for number in weights:
+            x = plain_layer(number, weights, x)
+        torch.testing.assert_close(got[task], x.flatten(1), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
+def test_loss_gradient_equals_autograd(loss: Loss) -> None:
+    torch.manual_seed(0)
+    raw = (3 * torch.randn(50, 3)).requires_grad_()
+    labels = torch.rand(50, 3).round()
+    (expected,) = torch.autograd.grad(loss.per_sample(raw, labels).sum(), raw)
+    torch.testing.assert_close(loss_gradient(loss, raw.detach(), labels), expected)
+
+
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
+def test_true_gradients_equal_autograd(tuned: int, loss: Loss) -> None:
+    tasks, (features, labels) = random_weights(tuned), random_data(tuned)
+    got = true_gradients(as_states(tasks), features, labels, loss)
+    assert set(got) == set(tasks[0])
+    for task, weights in enumerate(tasks):
+        x, activations = as_map(features[task]).requires_grad_(), {}
+        for number in weights:
+            x = activations[number] = plain_layer(number, weights, x)
+        total = loss.per_sample(x.flatten(1), labels[task]).sum()
+        expected = torch.autograd.grad(total, list(activations.values()))
+        for number, gradient in zip(activations, expected, strict=True):
+            flat = got[number][task, :, 0]
+            torch.testing.assert_close(flat, gradient.flatten(1), atol=1e-5, rtol=1e-5)
+
+
+def test_meta_gradients_flow_through_a_step() -> None:
+    features, labels = random_data(2)
+    states = as_states(random_weights(2))
+    scale = torch.ones(2, requires_grad=True)
+
+    def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
+        if layer == 6:
+            return loss_gradient(Loss(), activation, labels[:, :, None])
+        return scale[0] * made_up_gradient(layer, activation, labels)
+
+    rates = [scale[1] * 0.1, torch.tensor(0.1)]
+    updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
+    raw = outputs(updated, features)
+    Loss()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
+    assert scale.grad is not None
+    assert (scale.grad != 0).all()

@@ -1,0 +1,146 @@
+"""Exported trunk, head and network against torch and against each other."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+import torch
+from torch import nn
+
+from qsgm import QsgmError
+from qsgm.angles import AngleEncoding
+from qsgm.train.fold import FoldedNet, fold_net
+from qsgm.train.graphs.layers import window_weight
+from qsgm.train.graphs.probe import head_model
+from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
+from qsgm.train.graspnet import GraspNet, Loss, normalize
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Threads that wait for each other on a busy machine take longer than this work does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def net() -> GraspNet:
+    torch.manual_seed(0)
+    net = GraspNet()
+    for norm in net.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.running_mean.normal_()
+            norm.running_var.uniform_(0.1, 2)
+    return net.eval()
+
+
+@pytest.fixture(scope="module")
+def frame() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+
+
+def run(model: bytes, **feeds: np.ndarray) -> np.ndarray:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = ort.InferenceSession(model, options, ["CPUExecutionProvider"])
+    return session.run(None, feeds)[0]
+
+
+def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray:
+    feeds = {"features": features}
+    for number in range(7 - tuned, 7):
+        feeds[f"weight{number}"] = window_weight(net.layers[number - 1])
+        feeds[f"bias{number}"] = net.layers[number - 1].bias
+    return run(head_model(net, tuned, "double").SerializeToString(), **feeds)
+
+
+@pytest.mark.parametrize(("last_frozen", "positions"), [(3, 169), (4, 1), (5, 1)])
+def test_trunk_equals_torch(net: GraspNet, last_frozen: int, positions: int) -> None:
+    crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
+    got = run(trunk_model(fold_net(net), last_frozen).SerializeToString(), crops=crops)
+    with torch.no_grad():
+        maps = net.between(normalize(torch.tensor(crops)), 1, last_frozen)
+    assert got.shape == (5, positions, 16)
+    expected = maps.flatten(2).transpose(1, 2).numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("encoding", ["double", "paper"])
+def test_network_on_a_frame_equals_torch(
+    net: GraspNet, frame: np.ndarray, encoding: AngleEncoding
+) -> None:
+    got = run(network_model(fold_net(net), encoding).SerializeToString(), frame=frame)
+    with torch.no_grad():
+        raw = net(normalize(torch.tensor(frame)[None]))
+    assert got.shape == (3, 23, 33)
+    expected = Loss(encoding).activate(raw)[0].numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_every_cell_equals_trunk_and_head_on_its_window(
+    net: GraspNet, frame: np.ndarray, tuned: int
+) -> None:
+    folded = fold_net(net)
+    heatmap = run(network_model(folded, "double").SerializeToString(), frame=frame)
+    cells = [(row, col) for row in range(0, 23, 11) for col in range(0, 33, 8)]
+    windows = [frame[16 * row :][:128, 16 * col :][:, :128] for row, col in cells]
+    trunk = trunk_model(folded, 6 - tuned).SerializeToString()
+    got = head_outputs(folded, run(trunk, crops=np.stack(windows)), tuned)
+    rows, cols = np.transpose(cells)
+    np.testing.assert_allclose(got, heatmap[:, rows, cols].T, rtol=1e-5, atol=1e-5)
+
+
+def test_network_takes_frames_of_other_sizes(net: GraspNet) -> None:
+    model = network_model(fold_net(net), "double").SerializeToString()
+    assert run(model, frame=np.zeros((128, 128, 3), np.uint8)).shape == (3, 1, 1)
+    assert run(model, frame=np.zeros((144, 200, 3), np.uint8)).shape == (3, 2, 5)
+
+
+def test_patching_bytes_in_the_file_makes_the_tuned_network(
+    net: GraspNet, frame: np.ndarray
+) -> None:
+    data = network_model(fold_net(net), "double").SerializeToString()
+    torch.manual_seed(1)
+    tuned = GraspNet().eval()
+    for number in (1, 2, 3):
+        tuned.layers[number - 1] = net.layers[number - 1]
+    patched = bytearray(data)
+    offsets = initializer_offsets(data)
+    for number in (4, 5, 6):
+        layer = fold_net(tuned).layers[number - 1]
+        for name, array in ((f"weight{number}", layer.weight), (f"bias{number}", layer.bias)):
+            start, size = offsets[name]
+            assert size == array.nbytes
+            patched[start : start + size] = array.astype("<f4").tobytes()
+    expected = network_model(fold_net(tuned), "double")
+    onnx.checker.check_model(onnx.load_model_from_string(bytes(patched)), full_check=True)
+    assert bytes(patched) == expected.SerializeToString()
+    heatmap = run(expected.SerializeToString(), frame=frame)
+    np.testing.assert_array_equal(run(bytes(patched), frame=frame), heatmap)
+
+
+def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: GraspNet) -> None:
+    folded = fold_net(net)
+    for layer in folded.layers[3:5]:
+        layer.bias[:] = 0
+    data = network_model(folded, "double").SerializeToString()
+    offsets = initializer_offsets(data)
+    model = onnx.load_model_from_string(data)
+    assert offsets["bias4"] != offsets["bias5"]
+    for tensor in model.graph.initializer:
+        start, size = offsets[tensor.name]
+        assert data[start : start + size] == tensor.raw_data
+
+
+def test_initializers_outside_raw_data_are_refused(net: GraspNet) -> None:
+    model = network_model(fold_net(net), "double")
+    tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "bias6")
+    tensor.ClearField("raw_data")
+    tensor.float_data.extend([1.0, 2.0, 3.0])
+    with pytest.raises(QsgmError, match="'bias6' cannot be located"):
+        initializer_offsets(model.SerializeToString())

@@ -1,0 +1,82 @@
+"""Pictures: large enough, drawn where the numbers say, quiet where nothing was found."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from qsgm.pictures import draw_detection
+from qsgm.predict import Detection
+
+FRAME = np.full((480, 640, 3), 128, dtype=np.uint8)
+NOTHING = np.zeros((3, 23, 33), dtype=np.float32)
+
+
+def detection(found: bool = True, angle_deg: float = 0.0) -> Detection:
+    return Detection(found, 0.9 if found else 0.2, (200.0, 300.0), (-120.0, 60.0), angle_deg)
+
+
+def drawn(found: bool = True, angle_deg: float = 0.0) -> NDArray[np.uint8]:
+    return draw_detection(FRAME, NOTHING, detection(found, angle_deg), "mug")
+
+
+def is_white(picture: NDArray[np.uint8], x: float, y: float) -> bool:
+    """Whether the gripper covers a point of the frame [px]."""
+    return bool((picture[round(2 * y), round(2 * x)] > 240).all())
+
+
+@pytest.mark.parametrize("size", [(128, 128), (480, 640), (300, 1281)])
+def test_the_canvas_is_large_enough_for_crisp_text(size: tuple[int, int]) -> None:
+    frame = np.full((*size, 3), 90, dtype=np.uint8)
+    picture = draw_detection(frame, NOTHING, detection(), "a title that never ends " * 20)
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] >= 1280
+    assert picture.shape[1] % size[1] == 0
+    assert picture.shape[0] > size[0] * picture.shape[1] // size[1]
+
+
+def test_the_frame_and_the_heatmap_are_left_as_they_were() -> None:
+    frame, heatmap = FRAME.copy(), np.full((3, 23, 33), 0.8, dtype=np.float32)
+    draw_detection(frame, heatmap, detection(), "mug")
+    np.testing.assert_array_equal(frame, FRAME)
+    assert (heatmap == np.float32(0.8)).all()
+
+
+def test_the_fingers_are_turned_counter_clockwise_about_the_centre() -> None:
+    level, upright, tilted = drawn(angle_deg=0), drawn(angle_deg=90), drawn(angle_deg=30)
+    assert is_white(level, 200 + 38, 300 + 10)
+    assert is_white(level, 200 - 38, 300 - 10)
+    assert is_white(upright, 200 + 10, 300 - 38)
+    assert not is_white(upright, 200 + 38, 300 + 10)
+    # 38 px along an axis that rises to the right by 30 degrees
+    assert is_white(tilted, 200 + 32.9, 300 - 19)
+    assert not is_white(tilted, 200 + 32.9, 300 + 19)
+
+
+def test_nothing_is_drawn_far_from_the_object_and_the_way_to_it() -> None:
+    picture = drawn()
+    assert (picture[:300] == 128).all()
+    assert (picture[:960, 800:] == 128).all()
+
+
+def test_the_heatmap_shows_where_quality_is_notable_and_only_there() -> None:
+    heatmap = NOTHING.copy()
+    heatmap[0, 2, 28] = 0.9  # looks at pixel (512, 96)
+    picture = draw_detection(FRAME, heatmap, detection(), "mug")
+    blue, _, red = picture[192, 1024].astype(int)
+    assert red > blue + 40
+    assert (picture[192, 1024 + 128] == 128).all()
+    weak = draw_detection(FRAME, heatmap * np.float32(0.1), detection(), "mug")
+    np.testing.assert_array_equal(weak, drawn())
+
+
+def test_when_nothing_was_found_the_frame_is_dimmed_and_has_no_gripper() -> None:
+    picture = drawn(found=False)
+    assert (picture[:300] < 100).all()
+    assert not is_white(picture, 200 + 38, 300 + 10)
+    assert not is_white(picture, 200, 300)
+
+
+def test_the_verdict_has_its_own_colour() -> None:
+    found, missing = drawn()[1000, 2].astype(int), drawn(found=False)[1000, 2].astype(int)
+    assert found[1] > found[2]
+    assert missing[2] > missing[1]

@@ -1,0 +1,402 @@
+"""Exported training steps and probes against plain torch convolutions and autograd."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qsgm import QsgmError
+from qsgm.train.fold import FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.train.graphs.inspection import integer_operators
+from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
+from qsgm.train.graphs.probe import probe_model
+from qsgm.train.graphs.step import backprop_step_model, step_model
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
+from qsgm.train.sgm import Sgm
+
+CROPS, BATCH = 37, 8
+RATES = {4: 0.002, 5: 0.005, 6: 0.02}
+LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=3.0)]
+TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
+    Sgd: lambda groups: torch.optim.SGD(groups, momentum=0.9),
+    Adam: torch.optim.Adam,
+}
+
+Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Threads that wait for each other on a busy machine take longer than this work does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def net() -> FoldedNet:
+    torch.manual_seed(0)
+    return fold_net(GraspNet().eval())
+
+
+def random_sgms(extra: int = 3, hidden: int = 12) -> dict[int, FoldedSgm]:
+    sgms = {}
+    for layer in (4, 5):
+        torch.manual_seed(layer)
+        sgm = Sgm(layer, hidden)
+        sgm.conv1 = nn.Conv2d(16 + extra, hidden, 1)
+        sgms[layer] = fold_sgm(layer, sgm.eval())
+    return sgms
+
+
+def random_data(tuned: int) -> Arrays:
+    """Features of every crop as the frozen layers leave them, labels, last errors."""
+    rng = np.random.default_rng(tuned)
+    positions = 169 if tuned == 3 else 1
+    angle = rng.uniform(-np.pi, np.pi, CROPS)
+    quality = (rng.random(CROPS) < 0.6).astype(float)
+    data = {
+        "features": np.maximum(rng.normal(size=(CROPS, positions, 16)), 0),
+        "labels": np.stack([quality, np.sin(angle), np.cos(angle)], axis=1),
+        "last_error": rng.normal(size=(CROPS, 3)) / 3,
+    }
+    return {name: value.astype(np.float32) for name, value in data.items()}
+
+
+def session(model: onnx.ModelProto, **options: object) -> ort.InferenceSession:
+    chosen = ort.SessionOptions()
+    chosen.intra_op_num_threads = 1
+    for name, value in options.items():
+        setattr(chosen, name, value)
+    return ort.InferenceSession(model.SerializeToString(), chosen, ["CPUExecutionProvider"])
+
+
+class Exported:
+    """Runs a step graph and carries its state."""
+
+    def __init__(self, model: onnx.ModelProto, net: FoldedNet, data: Arrays) -> None:
+        self.session = session(model)
+        self.results = [result.name for result in self.session.get_outputs()]
+        self.feeds: Arrays = {}
+        for wanted in self.session.get_inputs():
+            name, number = wanted.name, wanted.name[-1]
+            if name in data:
+                self.feeds[name] = data[name]
+            elif name == f"weight{number}":
+                weight = net.layers[int(number) - 1].weight
+                self.feeds[name] = weight.transpose(0, 2, 3, 1).reshape(len(weight), -1)
+            elif name == f"bias{number}":
+                self.feeds[name] = net.layers[int(number) - 1].bias
+            elif name == f"rate{number}":
+                self.feeds[name] = np.array(RATES[int(number)], np.float32)
+            elif name != "rows":
+                dtype = np.int64 if name == "step" else np.float32
+                self.feeds[name] = np.zeros(wanted.shape, dtype)
+
+    def step(self, rows: np.ndarray) -> Arrays:
+        values = self.session.run(None, {**self.feeds, "rows": rows})
+        results = dict(zip(self.results, values, strict=True))
+        for name, value in results.items():
+            if name.endswith("_next"):
+                self.feeds[name.removesuffix("_next")] = value
+        return results
+
+
+class Reference:
+    """The last layers as torch convolutions, trained by autograd."""
+
+    def __init__(self, net: FoldedNet, tuned: int, loss: Loss, optimizer: Optimizer) -> None:
+        self.loss = loss
+        self.convs = {}
+        for number in range(7 - tuned, 7):
+            folded = net.layers[number - 1]
+            out_channels, in_channels, kernel, _ = folded.weight.shape
+            conv = nn.Conv2d(in_channels, out_channels, kernel, folded.stride)
+            conv.weight.data = torch.tensor(folded.weight)
+            conv.bias.data = torch.tensor(folded.bias)
+            self.convs[number] = conv
+        groups = [{"params": list(c.parameters()), "lr": RATES[n]} for n, c in self.convs.items()]
+        self.optimizer = TORCH_OPTIMIZERS[type(optimizer)](groups)
+
+    def layer(self, number: int, x: Tensor) -> Tensor:
+        x = self.convs[number](x)
+        x = F.relu(x) if number < 6 else x
+        return F.avg_pool2d(x, 5) if number == 4 else x
+
+    def backprop_step(self, x: Tensor, labels: Tensor) -> Tensor:
+        for number in self.convs:
+            x = self.layer(number, x)
+        return self.finish(x, self.loss(x.flatten(1), labels))
+
+    def local_step(self, x: Tensor, labels: Tensor, hints: Tensor, sgms: dict) -> Tensor:
+        """Every layer sees a detached input, and the SGM's gradient as if from behind."""
+        stand_in = torch.zeros(())
+        for number in self.convs:
+            x = self.layer(number, x.detach())
+            if number < 6:
+                gradient = sgm_gradient(sgms[number], x.detach(), labels, hints)
+                stand_in = stand_in + (x * gradient).sum() / len(x)
+        return self.finish(x, self.loss(x.flatten(1), labels), stand_in)
+
+    def finish(self, raw: Tensor, loss: Tensor, stand_in: Tensor | float = 0.0) -> Tensor:
+        """Update; return d loss / d raw of each sample (N, 3)."""
+        raw.retain_grad()
+        self.optimizer.zero_grad()
+        (loss + stand_in).backward()
+        self.optimizer.step()
+        self.last_loss = loss.item()
+        return raw.grad.flatten(1) * len(raw)
+
+
+def sgm_gradient(
+    sgm: FoldedSgm | QuantizedSgm, activation: Tensor, labels: Tensor, hints: Tensor
+) -> Tensor:
+    seen = torch.cat([activation.flatten(1), labels, hints], dim=1)
+    seen = seen[:, : activation.shape[1] + sgm.extra_channels]
+    if isinstance(sgm, QuantizedSgm):
+        return torch.tensor(integer_forward(sgm, seen.numpy())[0])[:, :, None, None]
+    weight1, bias1 = torch.tensor(sgm.conv1_weight), torch.tensor(sgm.conv1_bias)
+    weight2, bias2 = torch.tensor(sgm.conv2_weight), torch.tensor(sgm.conv2_bias)
+    return F.conv2d(F.relu(F.conv2d(seen[:, :, None, None], weight1, bias1)), weight2, bias2)
+
+
+def as_map(features: np.ndarray) -> Tensor:
+    """Position-major (N, P, C) to (N, C, H, W)."""
+    count, positions, channels = features.shape
+    side = round(positions**0.5)
+    return torch.tensor(features).reshape(count, side, side, channels).permute(0, 3, 1, 2)
+
+
+def picked(data: Arrays, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    """Features as a map, labels, last errors of a batch."""
+    features, labels, hints = (data[name][rows] for name in ("features", "labels", "last_error"))
+    return as_map(features), torch.tensor(labels), torch.tensor(hints)
+
+
+def assert_same_weights(exported: Exported, reference: Reference, tolerance: float) -> None:
+    for number, conv in reference.convs.items():
+        weight = conv.weight.detach().permute(0, 2, 3, 1).flatten(1)
+        for name, expected in (("weight", weight), ("bias", conv.bias.detach())):
+            got = torch.tensor(exported.feeds[f"{name}{number}"])
+            torch.testing.assert_close(got, expected, rtol=tolerance, atol=tolerance)
+
+
+def batches(steps: int) -> list[np.ndarray]:
+    """Epochs over shuffled crops; the last batch of each is shorter."""
+    rng, rows = np.random.default_rng(0), []
+    while len(rows) < steps:
+        order = rng.permutation(CROPS)
+        rows += [order[start : start + BATCH] for start in range(0, CROPS, BATCH)]
+    return rows[:steps]
+
+
+@pytest.mark.parametrize("extra", [3, 6])
+@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_a_local_update_equals_autograd_with_the_sgms_gradient_injected(
+    net: FoldedNet, tuned: int, loss: Loss, extra: int
+) -> None:
+    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(BATCH)
+    exported = Exported(step_model(net, tuned, sgms, loss, Sgd()), net, data)
+    reference = Reference(net, tuned, loss, Sgd())
+    assert ("last_error" in exported.feeds) == (extra == 6 and tuned > 1)
+    for number in reference.convs:  # compare whole gradients, not a thousandth of them
+        exported.feeds[f"rate{number}"] = np.array(1, np.float32)
+    for group in reference.optimizer.param_groups:
+        group["lr"] = 1.0
+    expected_error = reference.local_step(*picked(data, rows), sgms)
+    results = exported.step(rows)
+    assert_same_weights(exported, reference, 1e-5)
+    np.testing.assert_allclose(results["error"], expected_error, atol=1e-6)
+    assert results["loss"] == pytest.approx(reference.last_loss, abs=1e-6)
+
+
+@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_a_hundred_local_steps_equal_torchs(
+    net: FoldedNet, tuned: int, optimizer: Optimizer
+) -> None:
+    data, sgms = random_data(tuned), random_sgms()
+    for sgm in sgms.values():  # untrained as they are, keep them from running away
+        sgm.conv2_weight[:] *= 0.1
+        sgm.conv2_bias[:] *= 0.1
+    exported = Exported(step_model(net, tuned, sgms, Loss(), optimizer), net, data)
+    reference = Reference(net, tuned, Loss(), optimizer)
+    start = reference.convs[7 - tuned].weight.detach().clone()
+    for rows in batches(100):
+        expected_error = reference.local_step(*picked(data, rows), sgms)
+        results = exported.step(rows)
+        np.testing.assert_allclose(results["error"], expected_error, atol=1e-3)
+    assert_same_weights(exported, reference, 1e-4)
+    assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
+    assert exported.feeds.get("step", 100) == 100
+
+
+@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
+@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_a_hundred_backprop_steps_equal_torchs(
+    net: FoldedNet, tuned: int, optimizer: Optimizer
+) -> None:
+    data = random_data(tuned)
+    exported = Exported(backprop_step_model(net, tuned, Loss(), optimizer), net, data)
+    reference = Reference(net, tuned, Loss(), optimizer)
+    start = reference.convs[7 - tuned].weight.detach().clone()
+    for count, rows in enumerate(batches(100), start=1):
+        features, labels, _ = picked(data, rows)
+        expected_error = reference.backprop_step(features, labels)
+        results = exported.step(rows)
+        if count == 1:
+            assert_same_weights(exported, reference, 1e-5)
+        np.testing.assert_allclose(results["error"], expected_error, atol=1e-3)
+        assert results["loss"] == pytest.approx(reference.last_loss, abs=1e-4)
+    assert_same_weights(exported, reference, 1e-4)
+    assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
+def test_a_backprop_step_equals_autograd_for_both_angle_encodings(
+    net: FoldedNet, loss: Loss
+) -> None:
+    data, rows = random_data(3), np.arange(BATCH)
+    exported = Exported(backprop_step_model(net, 3, loss, Sgd()), net, data)
+    reference = Reference(net, 3, loss, Sgd())
+    features, labels, _ = picked(data, rows)
+    expected_error = reference.backprop_step(features, labels)
+    np.testing.assert_allclose(exported.step(rows)["error"], expected_error, atol=1e-6)
+    assert_same_weights(exported, reference, 1e-6)
+
+
+def test_loss_and_error_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
+    data = random_data(1)
+    data["features"] *= 1e5
+    exported = Exported(backprop_step_model(net, 1, Loss(), Sgd()), net, data)
+    results = exported.step(np.arange(CROPS))
+    assert np.isfinite(results["loss"])
+    assert np.isfinite(results["error"]).all()
+    assert results["loss"] > 1000
+
+
+def seen_by_sgms(
+    net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
+) -> dict[int, SgmRanges]:
+    reference = Reference(net, tuned, Loss(), Sgd())
+    x, labels, hints = picked(data, np.arange(CROPS))
+    ranges = {}
+    for number in range(7 - tuned, 6):
+        x = reference.layer(number, x).detach()
+        extra = torch.cat([labels, hints], dim=1)[:, : sgms[number].extra_channels]
+        seen = torch.cat([x.flatten(1), extra], dim=1)
+        weight = torch.tensor(sgms[number].conv1_weight[:, :, 0, 0])
+        hidden = F.relu(F.linear(seen, weight, torch.tensor(sgms[number].conv1_bias)))
+        low, high = seen.amin(dim=0).numpy(), seen.amax(dim=0).numpy()
+        ranges[number] = SgmRanges(low, high, hidden.amax(dim=0).numpy())
+    return ranges
+
+
+def quantized(
+    net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
+) -> dict[int, QuantizedSgm]:
+    ranges = seen_by_sgms(net, tuned, data, sgms)
+    return {number: quantize_sgm(sgms[number], ranges[number]) for number in ranges}
+
+
+@pytest.mark.parametrize("extra", [3, 6])
+@pytest.mark.parametrize("tuned", [2, 3])
+def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
+    net: FoldedNet, tuned: int, extra: int
+) -> None:
+    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(BATCH)
+    int8_sgms = quantized(net, tuned, data, sgms)
+    model = step_model(net, tuned, int8_sgms, Loss(), Sgd())
+    assert integer_operators(model) == ["QGemm"] * 2 * (tuned - 1)
+    exported = Exported(model, net, data)
+    reference = Reference(net, tuned, Loss(), Sgd())
+    reference.local_step(*picked(data, rows), int8_sgms)
+    exported.step(rows)
+    assert_same_weights(exported, reference, 1e-5)
+
+
+@pytest.mark.parametrize("extra", [3, 6])
+@pytest.mark.parametrize("tuned", [2, 3])
+def test_the_probe_gives_true_float_and_int8_gradients(
+    net: FoldedNet, tuned: int, extra: int
+) -> None:
+    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(20)
+    int8_sgms = quantized(net, tuned, data, sgms)
+    model = probe_model(net, tuned, sgms, int8_sgms, Loss())
+    assert integer_operators(model) == ["QGemm"] * 2 * (tuned - 1)
+    got = Exported(model, net, data).step(rows)
+
+    reference = Reference(net, tuned, Loss(), Sgd())
+    x, labels, hints = picked(data, rows)
+    activations = {}
+    for number in reference.convs:
+        x = activations[number] = reference.layer(number, x)
+    behind = {number: activations[number] for number in range(7 - tuned, 6)}
+    total = Loss().per_sample(x.flatten(1), labels).sum()
+    truths = torch.autograd.grad(total, list(behind.values()))
+    for (number, activation), truth in zip(behind.items(), truths, strict=True):
+        seen = activation.detach()
+        for name, expected in (
+            ("true", truth),
+            ("float", sgm_gradient(sgms[number], seen, labels, hints)),
+            ("int8", sgm_gradient(int8_sgms[number], seen, labels, hints)),
+        ):
+            np.testing.assert_allclose(got[f"{name}{number}"], expected.flatten(1), atol=1e-5)
+        assert got[f"clipped{number}"] == 0
+
+
+def test_the_probe_counts_inputs_beyond_their_ranges(net: FoldedNet) -> None:
+    data, sgms = random_data(2), random_sgms()
+    int8_sgms = quantized(net, 2, data, sgms)
+    data["labels"] = np.full((CROPS, 3), 9, np.float32)
+    got = Exported(probe_model(net, 2, sgms, int8_sgms, Loss()), net, data).step(np.arange(9))
+    assert got["clipped5"] == pytest.approx(3 / 19)
+
+
+def test_layers_run_one_after_the_other_so_that_their_memory_is_freed(
+    net: FoldedNet, tmp_path: Path
+) -> None:
+    data, sgms = random_data(3), random_sgms()
+    model = step_model(net, 3, quantized(net, 3, data, sgms), Loss(), Sgd())
+    exported = Exported(model, net, data)
+    profiled = session(model, enable_profiling=True, profile_file_prefix=str(tmp_path / "run"))
+    profiled.run(None, {**exported.feeds, "rows": np.arange(BATCH)})
+    events = json.loads(Path(profiled.end_profiling()).read_text())
+    order = [event["name"][:6] for event in events if event.get("cat") == "Node"]
+    layers = [name for name in order if name.startswith("layer")]
+    assert set(layers) == {"layer4", "layer5", "layer6"}
+    assert layers == sorted(layers)
+
+
+def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
+    model = step_model(net, 2, random_sgms(), Loss(), Sgd())
+    state = [f"{kind}{layer}" for layer in (5, 6) for kind in ("weight", "bias")]
+    state += [name[:-1] + "_momentum" + name[-1] for name in state]
+    others = {"features", "labels", "rows", "rate5", "rate6"}
+    assert {value.name for value in model.graph.input} == {*state, *others}
+    results = {value.name for value in model.graph.output}
+    assert results == {"loss", "error", *(f"{name}_next" for name in state)}
+    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
+
+
+@pytest.mark.parametrize("tuned", [0, 4])
+def test_another_number_of_layers_is_refused(net: FoldedNet, tuned: int) -> None:
+    with pytest.raises(QsgmError, match=f"last {tuned} layers: choose 1, 2 or 3"):
+        backprop_step_model(net, tuned, Loss(), Sgd())
+
+
+def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:
+    sgms = random_sgms()
+    del sgms[4]
+    with pytest.raises(QsgmError, match=r"no SGM for layers \[4\]"):
+        step_model(net, 3, sgms, Loss(), Sgd())
