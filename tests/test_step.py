@@ -99,8 +99,7 @@ class Exported:
             elif name == f"rate{number}":
                 self.feeds[name] = np.array(RATES[int(number)], np.float32)
             elif name != "rows":
-                dtype = np.int64 if name == "step" else np.float32
-                self.feeds[name] = np.zeros(wanted.shape, dtype)
+                self.feeds[name] = np.zeros(wanted.shape, np.float32)
 
     def step(self, rows: np.ndarray) -> Arrays:
         values = self.session.run(None, {**self.feeds, "rows": rows})

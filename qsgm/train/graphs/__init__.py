@@ -1,8 +1,9 @@
 """ONNX graphs of everything the device runs, in standard operators only.
 
 build      a graph, operator by operator
-trunk      crops to the frozen layers' features; image frames to heatmaps (also layer by layer)
-layers     one tuned layer: forward, back through its activation, weight gradient; the loss
+trunk      the network with constant weights: crops to features, a frame to its heatmap
+layers     one tuned layer: forward, back through its activation, weight gradient
+loss       output activation, loss and the error it starts with
 sgm        a static SGM in float and in int8
 optimizers SGD with momentum and Adam, one parameter at a time
 step       a whole training step, layer-local or by backpropagation

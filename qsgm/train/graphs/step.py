@@ -2,7 +2,8 @@
 
 Inputs: `features` (N, P, C), `labels` (N, 3) and, where an SGM takes it, `last_error` (N, 3), of
 all crops; `rows` (B,), the batch; one scalar `rate{k}` per layer; and the state, in which
-`weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the layer's and everything else starts at zero.
+`weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the layer's and everything else starts at zero
+(all float32; which inputs are state shows in the outputs' names).
 Outputs: every state under its name with `_next`; `error` (B, 3), d loss / d raw outputs of
 each sample; `loss`, the batch's mean.
 """
