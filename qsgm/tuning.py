@@ -24,22 +24,24 @@ class StepLoop:
         session: ort.InferenceSession,
         features: Array,  # (N, P, C), input of the first tuned layer
         labels: Array,  # (N, 3)
-        last_error: Array,  # (N, 3), d loss / d output when the crop was last seen
         weights: Mapping[str, Array],  # weight{k}: (Co, K), bias{k}: (Co,)
         rates: Mapping[int, float],  # per tuned layer
     ) -> None:
         self._session = session
-        self._last_error = np.array(last_error, dtype=np.float32)
-        self._names = [o.name for o in session.get_outputs() if o.name.endswith(NEXT)]
-        shapes = {i.name: i.shape for i in session.get_inputs()}
+        # Kept here, since bindings use these arrays' memory.
+        self._data = {
+            "features": np.ascontiguousarray(features, dtype=np.float32),
+            "labels": np.ascontiguousarray(labels, dtype=np.float32),
+            **{f"rate{k}": np.array(rate, dtype=np.float32) for k, rate in rates.items()},
+        }
+        results = [result.name for result in session.get_outputs()]
+        shapes = {wanted.name: wanted.shape for wanted in session.get_inputs()}
+        names = [name.removesuffix(NEXT) for name in results if name.endswith(NEXT)]
         start = {
-            name: np.array(weights[name]) if name in weights else np.zeros(shapes[name], np.float32)
-            for name in (n.removesuffix(NEXT) for n in self._names)
+            name: weights[name] if name in weights else np.zeros(shapes[name], np.float32)
+            for name in names
         }
         self._state = [_buffers(start), _buffers(start)]
-        fixed = {"features": features, "labels": labels, "last_error": self._last_error}
-        fixed |= {f"rate{k}": np.float32(rate).reshape(()) for k, rate in rates.items()}
-        self._fixed = {k: np.ascontiguousarray(v) for k, v in fixed.items() if k in shapes}
         self._bindings = [self._bind(0, 1), self._bind(1, 0)]
         self._now = 0
 
@@ -48,37 +50,35 @@ class StepLoop:
         binding = self._bindings[self._now]
         binding.bind_cpu_input("rows", rows)
         self._session.run_with_iobinding(binding)
-        error, loss = binding.get_outputs()[-2:]
-        self._last_error[rows] = error.numpy()
         self._now = 1 - self._now
-        return float(loss.numpy())
+        return float(binding.get_outputs()[-1].numpy())
 
     def weights(self) -> dict[str, Array]:
         """A copy of the weights and biases as they are now."""
         current = self._state[self._now]
-        return {n: v.numpy().copy() for n, v in current.items() if n.startswith(("weight", "bias"))
-                and "_" not in n}
-
-    @property
-    def last_error(self) -> Array:
-        """(N, 3); changes with every step."""
-        return self._last_error
+        return {name: current[name].numpy().copy() for name in current if _is_weight(name)}
 
     def _bind(self, source: int, target: int) -> ort.IOBinding:
         binding = self._session.io_binding()
-        for name, array in self._fixed.items():
+        for name, array in self._data.items():
             binding.bind_cpu_input(name, array)
-        for name in self._names:
-            binding.bind_ortvalue_input(name.removesuffix(NEXT), self._state[source][name.removesuffix(NEXT)])
-            binding.bind_ortvalue_output(name, self._state[target][name.removesuffix(NEXT)])
-        for name in ("error", "loss"):
-            binding.bind_output(name, "cpu")
+        for name in self._state[source]:
+            binding.bind_ortvalue_input(name, self._state[source][name])
+            binding.bind_ortvalue_output(name + NEXT, self._state[target][name])
+        binding.bind_output("loss", "cpu")  # the last one bound is the last of get_outputs
         return binding
+
+
+def _is_weight(name: str) -> bool:
+    """Whether a state is a layer's weight or bias rather than a moment or a count."""
+    return name.startswith(("weight", "bias")) and "_" not in name
 
 
 def _buffers(arrays: Mapping[str, Array]) -> dict[str, ort.OrtValue]:
     # An OrtValue shares the memory of the array it is made from, so every set gets its own copy.
-    return {name: ort.OrtValue.ortvalue_from_numpy(a.copy()) for name, a in arrays.items()}
+    return {
+        name: ort.OrtValue.ortvalue_from_numpy(np.array(a, order="C")) for name, a in arrays.items()
+    }
 
 
 def batches(count: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:

@@ -12,10 +12,10 @@ from torch import nn
 from qsgm import QsgmError
 from qsgm.angles import AngleEncoding
 from qsgm.train.fold import FoldedNet, fold_net
-from qsgm.train.graphs.layers import window_weight
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
 from qsgm.train.graspnet import GraspNet, Loss, normalize
+from qsgm.weights import to_conv_layout, to_step_layout
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -53,7 +53,7 @@ def run(model: bytes, **feeds: np.ndarray) -> np.ndarray:
 def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray:
     feeds = {"features": features}
     for number in range(7 - tuned, 7):
-        feeds[f"weight{number}"] = window_weight(net.layers[number - 1])
+        feeds[f"weight{number}"] = to_step_layout(net.layers[number - 1].weight)
         feeds[f"bias{number}"] = net.layers[number - 1].bias
     return run(head_model(net, tuned, "double").SerializeToString(), **feeds)
 
@@ -135,6 +135,16 @@ def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: G
     for tensor in model.graph.initializer:
         start, size = offsets[tensor.name]
         assert data[start : start + size] == tensor.raw_data
+
+
+@pytest.mark.parametrize("layer", range(1, 7))
+def test_weights_survive_the_way_into_the_steps_layout_and_back(net: GraspNet, layer: int) -> None:
+    weight = fold_net(net).layers[layer - 1].weight
+    windows = to_step_layout(weight)
+    out, into, kernel, _ = weight.shape
+    assert windows.shape == (out, kernel * kernel * into)
+    np.testing.assert_array_equal(windows[:, :into], weight[:, :, 0, 0])
+    np.testing.assert_array_equal(to_conv_layout(windows, kernel), weight)
 
 
 def test_initializers_outside_raw_data_are_refused(net: GraspNet) -> None:

@@ -1,7 +1,7 @@
 """Exported training steps and probes against plain torch convolutions and autograd."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +13,27 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qsgm import QsgmError
-from qsgm.train.fold import FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.train.fold import (
+    FoldedNet,
+    FoldedSgm,
+    fold_net,
+    fold_sgm,
+    run_folded_conv,
+    run_folded_sgm,
+)
 from qsgm.train.graphs.inspection import integer_operators
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
-from qsgm.train.graphs.step import backprop_step_model, step_model
+from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.sgm import Sgm
+from qsgm.tuning import StepLoop
+from qsgm.weights import to_step_layout
 
 CROPS, BATCH = 37, 8
 RATES = {4: 0.002, 5: 0.005, 6: 0.02}
+DEPTHS = pytest.mark.parametrize("hidden", [None, (64, 64)], ids=["paper", "deep"])
 LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=3.0)]
 TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
     Sgd: lambda groups: torch.optim.SGD(groups, momentum=0.9),
@@ -48,18 +58,13 @@ def net() -> FoldedNet:
     return fold_net(GraspNet().eval())
 
 
-def random_sgms(extra: int = 3, hidden: int = 12) -> dict[int, FoldedSgm]:
-    sgms = {}
-    for layer in (4, 5):
-        torch.manual_seed(layer)
-        sgm = Sgm(layer, hidden)
-        sgm.conv1 = nn.Conv2d(16 + extra, hidden, 1)
-        sgms[layer] = fold_sgm(layer, sgm.eval())
-    return sgms
+def random_sgms(hidden: Sequence[int] | None = None) -> dict[int, FoldedSgm]:
+    torch.manual_seed(4)
+    return {layer: fold_sgm(Sgm(layer, hidden).eval()) for layer in (4, 5)}
 
 
 def random_data(tuned: int) -> Arrays:
-    """Features of every crop as the frozen layers leave them, labels, last errors."""
+    """Features of every crop as the frozen layers leave them, and labels."""
     rng = np.random.default_rng(tuned)
     positions = 169 if tuned == 3 else 1
     angle = rng.uniform(-np.pi, np.pi, CROPS)
@@ -67,7 +72,6 @@ def random_data(tuned: int) -> Arrays:
     data = {
         "features": np.maximum(rng.normal(size=(CROPS, positions, 16)), 0),
         "labels": np.stack([quality, np.sin(angle), np.cos(angle)], axis=1),
-        "last_error": rng.normal(size=(CROPS, 3)) / 3,
     }
     return {name: value.astype(np.float32) for name, value in data.items()}
 
@@ -92,8 +96,7 @@ class Exported:
             if name in data:
                 self.feeds[name] = data[name]
             elif name == f"weight{number}":
-                weight = net.layers[int(number) - 1].weight
-                self.feeds[name] = weight.transpose(0, 2, 3, 1).reshape(len(weight), -1)
+                self.feeds[name] = to_step_layout(net.layers[int(number) - 1].weight)
             elif name == f"bias{number}":
                 self.feeds[name] = net.layers[int(number) - 1].bias
             elif name == f"rate{number}":
@@ -131,41 +134,34 @@ class Reference:
         x = F.relu(x) if number < 6 else x
         return F.avg_pool2d(x, 5) if number == 4 else x
 
-    def backprop_step(self, x: Tensor, labels: Tensor) -> Tensor:
+    def backprop_step(self, x: Tensor, labels: Tensor) -> float:
         for number in self.convs:
             x = self.layer(number, x)
-        return self.finish(x, self.loss(x.flatten(1), labels))
+        return self.finish(self.loss(x.flatten(1), labels))
 
-    def local_step(self, x: Tensor, labels: Tensor, hints: Tensor, sgms: dict) -> Tensor:
+    def local_step(self, x: Tensor, labels: Tensor, sgms: Mapping[int, AnySgm]) -> float:
         """Every layer sees a detached input, and the SGM's gradient as if from behind."""
         stand_in = torch.zeros(())
         for number in self.convs:
             x = self.layer(number, x.detach())
             if number < 6:
-                gradient = sgm_gradient(sgms[number], x.detach(), labels, hints)
+                gradient = sgm_gradient(sgms[number], x.detach(), labels)
                 stand_in = stand_in + (x * gradient).sum() / len(x)
-        return self.finish(x, self.loss(x.flatten(1), labels), stand_in)
+        return self.finish(self.loss(x.flatten(1), labels), stand_in)
 
-    def finish(self, raw: Tensor, loss: Tensor, stand_in: Tensor | float = 0.0) -> Tensor:
-        """Update; return d loss / d raw of each sample (N, 3)."""
-        raw.retain_grad()
+    def finish(self, loss: Tensor, stand_in: Tensor | float = 0.0) -> float:
+        """Update; return the loss before it."""
         self.optimizer.zero_grad()
         (loss + stand_in).backward()
         self.optimizer.step()
-        self.last_loss = loss.item()
-        return raw.grad.flatten(1) * len(raw)
+        return loss.item()
 
 
-def sgm_gradient(
-    sgm: FoldedSgm | QuantizedSgm, activation: Tensor, labels: Tensor, hints: Tensor
-) -> Tensor:
-    seen = torch.cat([activation.flatten(1), labels, hints], dim=1)
-    seen = seen[:, : activation.shape[1] + sgm.extra_channels]
-    if isinstance(sgm, QuantizedSgm):
-        return torch.tensor(integer_forward(sgm, seen.numpy())[0])[:, :, None, None]
-    weight1, bias1 = torch.tensor(sgm.conv1_weight), torch.tensor(sgm.conv1_bias)
-    weight2, bias2 = torch.tensor(sgm.conv2_weight), torch.tensor(sgm.conv2_bias)
-    return F.conv2d(F.relu(F.conv2d(seen[:, :, None, None], weight1, bias1)), weight2, bias2)
+def sgm_gradient(sgm: AnySgm, activation: Tensor, labels: Tensor) -> Tensor:
+    if isinstance(sgm, FoldedSgm):
+        return run_folded_sgm(sgm, activation, labels)
+    seen = torch.cat([activation.flatten(1), labels], dim=1)
+    return torch.tensor(integer_forward(sgm, seen.numpy())[0])[:, :, None, None]
 
 
 def as_map(features: np.ndarray) -> Tensor:
@@ -175,10 +171,9 @@ def as_map(features: np.ndarray) -> Tensor:
     return torch.tensor(features).reshape(count, side, side, channels).permute(0, 3, 1, 2)
 
 
-def picked(data: Arrays, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-    """Features as a map, labels, last errors of a batch."""
-    features, labels, hints = (data[name][rows] for name in ("features", "labels", "last_error"))
-    return as_map(features), torch.tensor(labels), torch.tensor(hints)
+def picked(data: Arrays, rows: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Features as a map and labels of a batch."""
+    return as_map(data["features"][rows]), torch.tensor(data["labels"][rows])
 
 
 def assert_same_weights(exported: Exported, reference: Reference, tolerance: float) -> None:
@@ -198,25 +193,23 @@ def batches(steps: int) -> list[np.ndarray]:
     return rows[:steps]
 
 
-@pytest.mark.parametrize("extra", [3, 6])
+@DEPTHS
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
 @pytest.mark.parametrize("tuned", [1, 2, 3])
 def test_a_local_update_equals_autograd_with_the_sgms_gradient_injected(
-    net: FoldedNet, tuned: int, loss: Loss, extra: int
+    net: FoldedNet, tuned: int, loss: Loss, hidden: Sequence[int] | None
 ) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(BATCH)
+    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(BATCH)
     exported = Exported(step_model(net, tuned, sgms, loss, Sgd()), net, data)
     reference = Reference(net, tuned, loss, Sgd())
-    assert ("last_error" in exported.feeds) == (extra == 6 and tuned > 1)
     for number in reference.convs:  # compare whole gradients, not a thousandth of them
         exported.feeds[f"rate{number}"] = np.array(1, np.float32)
     for group in reference.optimizer.param_groups:
         group["lr"] = 1.0
-    expected_error = reference.local_step(*picked(data, rows), sgms)
+    expected_loss = reference.local_step(*picked(data, rows), sgms)
     results = exported.step(rows)
     assert_same_weights(exported, reference, 1e-5)
-    np.testing.assert_allclose(results["error"], expected_error, atol=1e-6)
-    assert results["loss"] == pytest.approx(reference.last_loss, abs=1e-6)
+    assert results["loss"] == pytest.approx(expected_loss, abs=1e-6)
 
 
 @pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
@@ -226,15 +219,14 @@ def test_a_hundred_local_steps_equal_torchs(
 ) -> None:
     data, sgms = random_data(tuned), random_sgms()
     for sgm in sgms.values():  # untrained as they are, keep them from running away
-        sgm.conv2_weight[:] *= 0.1
-        sgm.conv2_bias[:] *= 0.1
+        sgm.convs[-1].weight[:] *= 0.1
+        sgm.convs[-1].bias[:] *= 0.1
     exported = Exported(step_model(net, tuned, sgms, Loss(), optimizer), net, data)
     reference = Reference(net, tuned, Loss(), optimizer)
     start = reference.convs[7 - tuned].weight.detach().clone()
     for rows in batches(100):
-        expected_error = reference.local_step(*picked(data, rows), sgms)
-        results = exported.step(rows)
-        np.testing.assert_allclose(results["error"], expected_error, atol=1e-3)
+        expected_loss = reference.local_step(*picked(data, rows), sgms)
+        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-4)
     assert_same_weights(exported, reference, 1e-4)
     assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
     assert exported.feeds.get("step", 100) == 100
@@ -250,13 +242,10 @@ def test_a_hundred_backprop_steps_equal_torchs(
     reference = Reference(net, tuned, Loss(), optimizer)
     start = reference.convs[7 - tuned].weight.detach().clone()
     for count, rows in enumerate(batches(100), start=1):
-        features, labels, _ = picked(data, rows)
-        expected_error = reference.backprop_step(features, labels)
-        results = exported.step(rows)
+        expected_loss = reference.backprop_step(*picked(data, rows))
+        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-4)
         if count == 1:
             assert_same_weights(exported, reference, 1e-5)
-        np.testing.assert_allclose(results["error"], expected_error, atol=1e-3)
-        assert results["loss"] == pytest.approx(reference.last_loss, abs=1e-4)
     assert_same_weights(exported, reference, 1e-4)
     assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
 
@@ -268,19 +257,17 @@ def test_a_backprop_step_equals_autograd_for_both_angle_encodings(
     data, rows = random_data(3), np.arange(BATCH)
     exported = Exported(backprop_step_model(net, 3, loss, Sgd()), net, data)
     reference = Reference(net, 3, loss, Sgd())
-    features, labels, _ = picked(data, rows)
-    expected_error = reference.backprop_step(features, labels)
-    np.testing.assert_allclose(exported.step(rows)["error"], expected_error, atol=1e-6)
+    expected_loss = reference.backprop_step(*picked(data, rows))
+    assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-6)
     assert_same_weights(exported, reference, 1e-6)
 
 
-def test_loss_and_error_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
+def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
     data = random_data(1)
     data["features"] *= 1e5
     exported = Exported(backprop_step_model(net, 1, Loss(), Sgd()), net, data)
     results = exported.step(np.arange(CROPS))
-    assert np.isfinite(results["loss"])
-    assert np.isfinite(results["error"]).all()
+    assert all(np.isfinite(value).all() for value in results.values())
     assert results["loss"] > 1000
 
 
@@ -288,16 +275,16 @@ def seen_by_sgms(
     net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
 ) -> dict[int, SgmRanges]:
     reference = Reference(net, tuned, Loss(), Sgd())
-    x, labels, hints = picked(data, np.arange(CROPS))
+    x, labels = picked(data, np.arange(CROPS))
     ranges = {}
     for number in range(7 - tuned, 6):
         x = reference.layer(number, x).detach()
-        extra = torch.cat([labels, hints], dim=1)[:, : sgms[number].extra_channels]
-        seen = torch.cat([x.flatten(1), extra], dim=1)
-        weight = torch.tensor(sgms[number].conv1_weight[:, :, 0, 0])
-        hidden = F.relu(F.linear(seen, weight, torch.tensor(sgms[number].conv1_bias)))
-        low, high = seen.amin(dim=0).numpy(), seen.amax(dim=0).numpy()
-        ranges[number] = SgmRanges(low, high, hidden.amax(dim=0).numpy())
+        seen = torch.cat([x.flatten(1), labels], dim=1)
+        hidden = [seen[:, :, None, None]]
+        for conv in sgms[number].convs[:-1]:
+            hidden.append(F.relu(run_folded_conv(conv, hidden[-1])))
+        highs = tuple(tensor.amax(dim=(0, 2, 3)).numpy() for tensor in hidden[1:])
+        ranges[number] = SgmRanges(seen.amin(dim=0).numpy(), seen.amax(dim=0).numpy(), highs)
     return ranges
 
 
@@ -308,15 +295,15 @@ def quantized(
     return {number: quantize_sgm(sgms[number], ranges[number]) for number in ranges}
 
 
-@pytest.mark.parametrize("extra", [3, 6])
+@DEPTHS
 @pytest.mark.parametrize("tuned", [2, 3])
 def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
-    net: FoldedNet, tuned: int, extra: int
+    net: FoldedNet, tuned: int, hidden: Sequence[int] | None
 ) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(BATCH)
+    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(BATCH)
     int8_sgms = quantized(net, tuned, data, sgms)
     model = step_model(net, tuned, int8_sgms, Loss(), Sgd())
-    assert integer_operators(model) == ["QGemm"] * 2 * (tuned - 1)
+    assert integer_operators(model) == ["QGemm"] * len(sgms[4].convs) * (tuned - 1)
     exported = Exported(model, net, data)
     reference = Reference(net, tuned, Loss(), Sgd())
     reference.local_step(*picked(data, rows), int8_sgms)
@@ -324,19 +311,19 @@ def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
     assert_same_weights(exported, reference, 1e-5)
 
 
-@pytest.mark.parametrize("extra", [3, 6])
+@DEPTHS
 @pytest.mark.parametrize("tuned", [2, 3])
 def test_the_probe_gives_true_float_and_int8_gradients(
-    net: FoldedNet, tuned: int, extra: int
+    net: FoldedNet, tuned: int, hidden: Sequence[int] | None
 ) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(extra), np.arange(20)
+    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(20)
     int8_sgms = quantized(net, tuned, data, sgms)
     model = probe_model(net, tuned, sgms, int8_sgms, Loss())
-    assert integer_operators(model) == ["QGemm"] * 2 * (tuned - 1)
+    assert integer_operators(model) == ["QGemm"] * len(sgms[4].convs) * (tuned - 1)
     got = Exported(model, net, data).step(rows)
 
     reference = Reference(net, tuned, Loss(), Sgd())
-    x, labels, hints = picked(data, rows)
+    x, labels = picked(data, rows)
     activations = {}
     for number in reference.convs:
         x = activations[number] = reference.layer(number, x)
@@ -347,8 +334,8 @@ def test_the_probe_gives_true_float_and_int8_gradients(
         seen = activation.detach()
         for name, expected in (
             ("true", truth),
-            ("float", sgm_gradient(sgms[number], seen, labels, hints)),
-            ("int8", sgm_gradient(int8_sgms[number], seen, labels, hints)),
+            ("float", sgm_gradient(sgms[number], seen, labels)),
+            ("int8", sgm_gradient(int8_sgms[number], seen, labels)),
         ):
             np.testing.assert_allclose(got[f"{name}{number}"], expected.flatten(1), atol=1e-5)
         assert got[f"clipped{number}"] == 0
@@ -384,7 +371,7 @@ def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
     others = {"features", "labels", "rows", "rate5", "rate6"}
     assert {value.name for value in model.graph.input} == {*state, *others}
     results = {value.name for value in model.graph.output}
-    assert results == {"loss", "error", *(f"{name}_next" for name in state)}
+    assert results == {"loss", *(f"{name}_next" for name in state)}
     assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
 
 
@@ -392,6 +379,33 @@ def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
 def test_another_number_of_layers_is_refused(net: FoldedNet, tuned: int) -> None:
     with pytest.raises(QsgmError, match=f"last {tuned} layers: choose 1, 2 or 3"):
         backprop_step_model(net, tuned, Loss(), Sgd())
+
+
+def test_there_is_nothing_to_probe_behind_the_last_layer(net: FoldedNet) -> None:
+    with pytest.raises(QsgmError, match="SGMs of 1 tuned layers: the last layer has none"):
+        probe_model(net, 1, {}, {}, Loss())
+
+
+@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
+def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
+    net: FoldedNet, optimizer: Optimizer
+) -> None:
+    data = random_data(3)
+    model = step_model(net, 3, random_sgms((64, 64)), Loss(), optimizer)
+    exported = Exported(model, net, data)
+    start = {
+        name: value.copy()
+        for name, value in exported.feeds.items()
+        if name in {f"{kind}{k}" for kind in ("weight", "bias") for k in RATES}
+    }
+    loop = StepLoop(session(model), data["features"], data["labels"], start, RATES)
+    for rows in batches(12):
+        assert loop.step(rows) == float(exported.step(rows)["loss"])
+    tuned = loop.weights()
+    assert set(tuned) == set(start)
+    for name, value in tuned.items():
+        np.testing.assert_array_equal(value, exported.feeds[name])
+        assert not np.array_equal(value, start[name])
 
 
 def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:

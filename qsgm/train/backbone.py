@@ -33,7 +33,7 @@ class BackboneTraining:
     def __init__(self, config: BackboneConfig, loss: Loss, seed: int, device: str) -> None:
         torch.manual_seed(seed)
         self.config, self.loss, self.seed, self.device = config, loss, seed, device
-        self.net = GraspNet().to(device, memory_format=torch.channels_last)
+        self.net = in_memory_format(GraspNet().to(device), torch.channels_last)
         self.optimizer = torch.optim.AdamW(
             self.net.parameters(), config.peak_rate, weight_decay=config.weight_decay
         )
@@ -53,7 +53,8 @@ class BackboneTraining:
             self.schedule.step()
             self.step += 1
             after_step(self.step, loss.item())
-        return self.net.eval()
+        self.net.eval()
+        return self.net
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on later."""
@@ -63,7 +64,9 @@ class BackboneTraining:
     def resume(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state`; the batches to come are those an unbroken run would see."""
         self.step = state["step"]
-        for part, saved in zip((self.net, self.optimizer, self.schedule), state["parts"], strict=True):
+        for part, saved in zip(
+            (self.net, self.optimizer, self.schedule), state["parts"], strict=True
+        ):
             part.load_state_dict(saved)
 
     def _outputs(self, crops: Tensor) -> Tensor:
@@ -85,3 +88,9 @@ class BackboneTraining:
                 prefetch_factor=4 if self.config.loader_processes else None,
             )
         )
+
+
+def in_memory_format(net: GraspNet, memory_format: torch.memory_format) -> GraspNet:
+    """The same network with its weights laid out otherwise; torch's types do not know the call."""
+    net.to(memory_format=memory_format)  # type: ignore[call-overload]
+    return net

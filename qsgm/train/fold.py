@@ -47,19 +47,19 @@ class FoldedNet:
 
 
 @dataclass(frozen=True)
+class FoldedConv:
+    """A convolution of an SGM, padded to keep the size."""
+
+    weight: FloatArray  # (O, I, k, k)
+    bias: FloatArray  # (O,)
+
+
+@dataclass(frozen=True)
 class FoldedSgm:
-    """The SGM behind layer `layer`: convolution, ReLU, convolution; padded to keep the size."""
+    """The SGM behind layer `layer`: convolutions with ReLU between."""
 
     layer: int
-    conv1_weight: FloatArray  # (H, Ci, k, k)
-    conv1_bias: FloatArray  # (H,)
-    conv2_weight: FloatArray  # (C, H, k, k)
-    conv2_bias: FloatArray  # (C,)
-
-    @property
-    def extra_channels(self) -> int:
-        """Input channels beside the activation: 3 (label) or 6 (label and last error)."""
-        return int(self.conv1_weight.shape[1] - self.conv2_weight.shape[0])
+    convs: tuple[FoldedConv, ...]
 
 
 def fold_net(net: GraspNet) -> FoldedNet:
@@ -84,19 +84,14 @@ def fold_layer(number: int, layer: Layer) -> FoldedLayer:
     )
 
 
-def fold_sgm(layer: int, sgm: Sgm) -> FoldedSgm:
-    """Fold the batchnorm of the SGM behind `layer`. Raises QsgmError as :func:`fold_net` does."""
-    where = f"the SGM behind layer {layer}"
-    refuse_other_norms(sgm, [sgm.norm])
-    first = absorb_norm(*as_float64(sgm.conv1), sgm.norm, where)
-    second = as_float64(sgm.conv2)
-    folded = FoldedSgm(layer, *as_float32(where, *first), *as_float32(where, *second))
-    if folded.extra_channels not in (3, 6):
-        raise QsgmError(
-            f"{where} has {folded.extra_channels} input channels beside the activation: expected 3"
-            " (label) or 6 (label and last error); pretrain it again with this version"
-        )
-    return folded
+def fold_sgm(sgm: Sgm) -> FoldedSgm:
+    """Fold an SGM's batchnorms. Raises QsgmError as :func:`fold_net` does."""
+    where = f"the SGM behind layer {sgm.layer}"
+    refuse_other_norms(sgm, sgm.norms)
+    folded = [as_float64(conv) for conv in convolutions(sgm)]
+    for i, norm in enumerate(batchnorms(sgm)):
+        folded[i] = absorb_norm(*folded[i], norm, where)
+    return FoldedSgm(sgm.layer, tuple(FoldedConv(*as_float32(where, *conv)) for conv in folded))
 
 
 def net_fold_error(net: GraspNet, folded: FoldedNet, crops: Tensor) -> float:
@@ -107,12 +102,18 @@ def net_fold_error(net: GraspNet, folded: FoldedNet, crops: Tensor) -> float:
     return float((before - after).abs().max())
 
 
-def sgm_fold_error(sgm: Sgm, folded: FoldedSgm, inputs: Tensor) -> float:
-    """Largest |difference| of gradients before and after folding; inputs (N, Ci, H, W)."""
-    original = copy.deepcopy(sgm).eval()
+def sgm_fold_error(sgm: Sgm, folded: FoldedSgm, activation: Tensor, labels: Tensor) -> float:
+    """Largest |difference| of gradients before and after folding.
+
+    Args:
+        sgm: as trained.
+        folded: what :func:`fold_sgm` made of it.
+        activation: (N, C, H, W).
+        labels: (N, 3).
+    """
     with torch.no_grad():
-        before = original.conv2(F.relu(original.norm(original.conv1(inputs))))
-        after = run_folded_sgm(folded, inputs)
+        before = copy.deepcopy(sgm).eval()(activation, labels)
+        after = run_folded_sgm(folded, activation, labels)
     return float((before - after).abs().max())
 
 
@@ -126,13 +127,29 @@ def run_folded(folded: FoldedNet, crops: Tensor) -> Tensor:
     return x
 
 
-def run_folded_sgm(folded: FoldedSgm, inputs: Tensor) -> Tensor:
-    """Gradients (N, C, H, W) from the concatenated inputs (N, Ci, H, W)."""
-    pad = folded.conv1_weight.shape[2] // 2
-    weight1, bias1 = torch.tensor(folded.conv1_weight), torch.tensor(folded.conv1_bias)
-    weight2, bias2 = torch.tensor(folded.conv2_weight), torch.tensor(folded.conv2_bias)
-    hidden = F.relu(F.conv2d(inputs, weight1, bias1, padding=pad))
-    return F.conv2d(hidden, weight2, bias2, padding=pad)
+def run_folded_sgm(folded: FoldedSgm, activation: Tensor, labels: Tensor) -> Tensor:
+    """Activation (N, C, H, W) and labels (N, 3) to gradients (N, C, H, W)."""
+    filled = labels[:, :, None, None].expand(-1, -1, *activation.shape[2:])
+    x = torch.cat([activation, filled], dim=1)
+    for conv in folded.convs[:-1]:
+        x = F.relu(run_folded_conv(conv, x))
+    return run_folded_conv(folded.convs[-1], x)
+
+
+def run_folded_conv(conv: FoldedConv, x: Tensor) -> Tensor:
+    """x (N, I, H, W) to (N, O, H, W)."""
+    pad = conv.weight.shape[2] // 2
+    return F.conv2d(x, torch.tensor(conv.weight), torch.tensor(conv.bias), padding=pad)
+
+
+def convolutions(sgm: Sgm) -> list[nn.Conv2d]:
+    """An SGM's convolutions, in order."""
+    return [conv for conv in sgm.convs if isinstance(conv, nn.Conv2d)]
+
+
+def batchnorms(sgm: Sgm) -> list[nn.BatchNorm2d]:
+    """An SGM's batchnorms, one behind every convolution but the last."""
+    return [norm for norm in sgm.norms if isinstance(norm, nn.BatchNorm2d)]
 
 
 def as_float64(conv: nn.Conv2d) -> tuple[Tensor, Tensor]:

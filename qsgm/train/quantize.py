@@ -5,14 +5,15 @@ Every channel has a scale of its own, and none of them costs anything at run tim
 1. Inputs. Channel i is mapped from [low, high] onto 0..255 by an affine map, rounded and clipped.
    Its inverse is folded into the first product: W' = W * (high - low) / 255, b' = b + W low.
 2. Hidden. ReLU commutes with positive factors, so hidden_high / 255 of each channel divides its
-   row of the first product and multiplies its column of the second.
-3. Both u8 tensors are then left with scale 1 and zero point 0, an int32 bias has exactly its
+   row of the product before it and multiplies its column of the product behind it.
+3. All u8 tensors are then left with scale 1 and zero point 0, an int32 bias has exactly its
    weight row's scale, and the gradient needs no scale at all: it leaves the last product as float.
 
 Case 1 is exact for 1x1 kernels only: a padded kernel needs x = 0 at the border, while a u8 zero
 means x = low. Larger kernels are refused.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +40,7 @@ class SgmRanges:
 
     input_low: FloatArray  # (Ci,)
     input_high: FloatArray  # (Ci,)
-    hidden_high: FloatArray  # (H,), after ReLU
+    hidden_high: tuple[FloatArray, ...]  # (H,) of each hidden tensor, after ReLU
 
 
 @dataclass(frozen=True)
@@ -58,60 +59,70 @@ class QuantizedSgm:
     layer: int
     input_low: FloatArray  # (Ci,)
     input_gain: FloatArray  # (Ci,), u8 steps per unit
-    first: QuantizedProduct
-    second: QuantizedProduct
+    products: tuple[QuantizedProduct, ...]  # ReLU between
     dead_inputs: tuple[int, ...]  # channels that calibration saw constant
-    dead_hidden: tuple[int, ...]  # channels that calibration never saw above zero
-
-    @property
-    def extra_channels(self) -> int:
-        """Input channels beside the activation: 3 (label) or 6 (label and last error)."""
-        return int(self.first.weight.shape[1] - self.second.weight.shape[0])
+    dead_hidden: tuple[tuple[int, ...], ...]  # channels that it never saw above zero, per tensor
 
 
 def quantize_sgm(sgm: FoldedSgm, ranges: SgmRanges) -> QuantizedSgm:
-    """Fold both tensors' channel scales into the weights and round those.
+    """Fold all tensors' channel scales into the weights and round those.
 
     Raises QsgmError for kernels larger than 1x1 and for ranges that do not fit the SGM.
     """
-    if sgm.conv1_weight.shape[2:] != (1, 1) or sgm.conv2_weight.shape[2:] != (1, 1):
-        raise QsgmError(
-            f"the SGM behind layer {sgm.layer} has a {sgm.conv1_weight.shape[2]}x"
-            f"{sgm.conv1_weight.shape[3]} kernel: only 1x1 can be quantized (layers 4 and 5);"
-            " leave it in float"
-        )
-    weight1 = sgm.conv1_weight[:, :, 0, 0].astype(np.float64)
-    weight2 = sgm.conv2_weight[:, :, 0, 0].astype(np.float64)
+    check_kernels(sgm)
     check_ranges(sgm, ranges)
-    span, dead_inputs = live_span(ranges.input_high.astype(np.float64) - ranges.input_low)
-    hidden, dead_hidden = live_span(ranges.hidden_high.astype(np.float64))
+    low = ranges.input_low.astype(np.float32)
+    span, dead_inputs = live_span(ranges.input_high.astype(np.float64) - low)
+    hidden = [live_span(high.astype(np.float64)) for high in ranges.hidden_high]
 
+    weights = [conv.weight[:, :, 0, 0].astype(np.float64) for conv in sgm.convs]
+    biases = [conv.bias.astype(np.float64) for conv in sgm.convs]
+    biases[0] += weights[0] @ low.astype(np.float64)
     # The weights absorb the very gains that the graph will use, rounded to float32 as they are.
     gain = (U8_MAX / span).astype(np.float32)
-    low = ranges.input_low.astype(np.float32)
-    hidden_step = hidden / U8_MAX
-    bias1 = sgm.conv1_bias + weight1 @ low.astype(np.float64)
-    first = quantize_product(weight1 / gain / hidden_step[:, None], bias1 / hidden_step)
-    second = quantize_product(weight2 * hidden_step, sgm.conv2_bias.astype(np.float64))
-    return QuantizedSgm(sgm.layer, low, gain, first, second, dead_inputs, dead_hidden)
+    # What one step of each tensor's channels stands for; the gradient stays what it is.
+    steps = [1 / gain.astype(np.float64), *(high / U8_MAX for high, _ in hidden)]
+    steps.append(np.ones(len(weights[-1])))
+    products = (
+        quantize_product(weight * into / out[:, None], bias / out)
+        for weight, bias, into, out in zip(weights, biases, steps, steps[1:], strict=False)
+    )
+    dead_hidden = tuple(dead for _, dead in hidden)
+    return QuantizedSgm(sgm.layer, low, gain, tuple(products), dead_inputs, dead_hidden)
+
+
+def check_kernels(sgm: FoldedSgm) -> None:
+    """Raise QsgmError unless every convolution is 1x1."""
+    for conv in sgm.convs:
+        if conv.weight.shape[2:] != (1, 1):
+            raise QsgmError(
+                f"the SGM behind layer {sgm.layer} has a {conv.weight.shape[2]}x"
+                f"{conv.weight.shape[3]} kernel: only 1x1 can be quantized (layers 4 and 5);"
+                " leave it in float"
+            )
 
 
 def check_ranges(sgm: FoldedSgm, ranges: SgmRanges) -> None:
     """Raise QsgmError unless the ranges fit the SGM's shapes, are finite and not reversed."""
-    hidden, inputs = sgm.conv1_weight.shape[:2]
-    got = ranges.input_low.shape, ranges.input_high.shape, ranges.hidden_high.shape
-    if got != ((inputs,), (inputs,), (hidden,)):
+    inputs, hidden = sgm.convs[0].weight.shape[1], [len(conv.bias) for conv in sgm.convs[:-1]]
+    got = shapes([ranges.input_low, ranges.input_high, *ranges.hidden_high])
+    if got != [(inputs,), (inputs,), *((width,) for width in hidden)]:
         raise QsgmError(
             f"ranges for the SGM behind layer {sgm.layer} have shapes {got}, expected"
             f" {inputs} inputs twice and {hidden} hidden channels; calibrate again"
         )
-    spans = np.concatenate([ranges.input_high - ranges.input_low, ranges.hidden_high])
+    spans = np.concatenate([ranges.input_high - ranges.input_low, *ranges.hidden_high])
     if not np.isfinite(spans).all() or spans.min() < 0:
         raise QsgmError(
             f"ranges for the SGM behind layer {sgm.layer} must be finite with low <= high"
             f" and hidden_high >= 0, got spans from {spans.min():g} to {spans.max():g};"
             " calibrate again"
         )
+
+
+def shapes(arrays: Sequence[FloatArray]) -> list[tuple[int, ...]]:
+    """Every array's shape."""
+    return [array.shape for array in arrays]
 
 
 def live_span(span: Float64Array) -> tuple[Float64Array, tuple[int, ...]]:
@@ -143,7 +154,7 @@ def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, fl
 
     Args:
         q: the quantized SGM.
-        inputs: float32 (N, Ci): activation, label and, if it takes one, last error.
+        inputs: float32 (N, Ci): activation and label side by side.
 
     Returns:
         Gradients float32 (N, C), and the fraction of inputs that lay outside their range.
@@ -154,13 +165,15 @@ def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, fl
 
 def integer_trace(
     q: QuantizedSgm, inputs: FloatArray
-) -> tuple[FloatArray, NDArray[np.uint8], float]:
-    """:func:`integer_forward` with the hidden tensor, u8 (N, H), between its results."""
+) -> tuple[FloatArray, list[NDArray[np.uint8]], float]:
+    """:func:`integer_forward` with the hidden tensors, u8 (N, H), between its results."""
     scaled = (inputs - q.input_low) * q.input_gain
     outside = (scaled < -CLIP_TOLERANCE_STEPS) | (scaled > U8_MAX + CLIP_TOLERANCE_STEPS)
-    # ReLU is the clipping at zero: a u8 with zero point 0 holds nothing below it.
-    hidden = to_u8(integer_product(q.first, to_u8(scaled)))
-    return integer_product(q.second, hidden), hidden, float(outside.mean())
+    rounded = [to_u8(scaled)]
+    for product in q.products[:-1]:
+        # ReLU is the clipping at zero: a u8 with zero point 0 holds nothing below it.
+        rounded.append(to_u8(integer_product(product, rounded[-1])))
+    return integer_product(q.products[-1], rounded[-1]), rounded[1:], float(outside.mean())
 
 
 def to_u8(x: FloatArray) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ none: its gradient comes from the loss.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -37,8 +38,7 @@ class Sgm(nn.Module):
         kernel = KERNEL_BEHIND_LAYER[layer]
         widths = (CHANNELS[layer] + LABEL_CHANNELS, *self.hidden, CHANNELS[layer])
         self.convs = nn.ModuleList(
-            nn.Conv2d(into, out, kernel, padding=kernel // 2)
-            for into, out in zip(widths, widths[1:], strict=False)
+            nn.Conv2d(into, out, kernel, padding=kernel // 2) for into, out in pairwise(widths)
         )
         self.norms = nn.ModuleList(nn.BatchNorm2d(width) for width in self.hidden)
 
@@ -91,7 +91,7 @@ class _Substitute(torch.autograd.Function):
         return activation.view_as(activation)
 
     @staticmethod
-    def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor, None, None]:
         batch = len(incoming)
         if ctx.teacher is not None:
             with torch.enable_grad():

@@ -4,6 +4,7 @@ A task is one object, as the device will meet it: a demonstration frame, crops o
 the frozen layers, and labels aligned with the network's own idea of the object's axis.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,7 @@ from torch.utils.data import Dataset
 from qsgm.angles import decode_angle, mean_direction, wrap_half_turn
 from qsgm.crops import CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.train.graspnet import LAYERS, GraspNet, Loss, normalize
+from qsgm.train.local import LayerState
 from qsgm.train.objects import draw_frame
 
 CENTER_PX = (320.0, 240.0)
@@ -98,3 +100,51 @@ def make_task(
     raw = net.between(maps, last_frozen + 1, LAYERS)[:, :, 0, 0]
     offset = axis_offset(raw, plan, loss)
     return Task(features, torch.from_numpy(label_crops(plan, offset, loss.encoding)), offset)
+
+
+@dataclass(frozen=True)
+class TaskSet:
+    """T tasks of N crops each; the first `support` crops are for learning, the rest is query."""
+
+    features: Tensor  # (T, N, P, C), half precision
+    labels: Tensor  # (T, N, 3)
+    support: int
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def chunks(self, size: int) -> Iterator["TaskSet"]:
+        """The same tasks in groups of at most `size`."""
+        for start in range(0, len(self), size):
+            rows = slice(start, start + size)
+            yield TaskSet(self.features[rows], self.labels[rows], self.support)
+
+
+def draw_tasks(
+    net: GraspNet,
+    count: int,
+    crops: int,
+    seed: int,
+    loss: Loss,
+    after_task: Callable[[], None],
+) -> TaskSet:
+    """Draw `count` objects and featurize `crops` of each; four fifths of them are support."""
+    tasks = []
+    for i in range(count):
+        rng = np.random.default_rng((seed, i))
+        frame = draw_frame(rng).image
+        tasks.append(make_task(net, frame, rng, last_frozen=3, count=crops, loss=loss))
+        after_task()
+    return TaskSet(
+        torch.stack([task.features.half() for task in tasks]),
+        torch.stack([task.labels for task in tasks]),
+        support=crops * 4 // 5,
+    )
+
+
+def start_states(start: Sequence[tuple[Tensor, Tensor]], tasks: int) -> list[LayerState]:
+    """The same start (weight (K, Co), bias (Co,)) of every tuned layer for each task."""
+    return [
+        LayerState.start(weight.expand(tasks, -1, -1), bias.expand(tasks, -1))
+        for weight, bias in start
+    ]

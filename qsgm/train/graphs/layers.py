@@ -11,9 +11,10 @@ import numpy as np
 from onnx import TensorProto
 
 from qsgm.errors import QsgmError
-from qsgm.train.fold import FloatArray, FoldedLayer, FoldedNet
+from qsgm.train.fold import FoldedLayer, FoldedNet
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graspnet import LAYERS
+from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
 TUNABLE = (1, 2, 3)  # how many of the last layers a graph can train
@@ -54,7 +55,6 @@ class Batch:
 
     features: Value  # (B, P, C)
     labels: Value  # (B, 3)
-    last_error: Value | None  # (B, 3), where an SGM takes it
     share: Value  # 1 / B
 
 
@@ -80,11 +80,6 @@ def input_side(net: FoldedNet, number: int) -> int:
     return side
 
 
-def window_weight(layer: FoldedLayer) -> FloatArray:
-    """A convolution's weight (Co, Ci, kh, kw) as the step graphs hold it, (Co, kh * kw * Ci)."""
-    return np.ascontiguousarray(layer.weight.transpose(0, 2, 3, 1).reshape(len(layer.bias), -1))
-
-
 def first_tuned(tuned: int) -> int:
     """The number of the first of the last `tuned` layers.
 
@@ -100,7 +95,7 @@ def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]
     layers = []
     for number in range(first_tuned(tuned), LAYERS + 1):
         folded = net.layers[number - 1]
-        shape = window_weight(folded).shape
+        shape = to_step_layout(folded.weight).shape
         weight = graph.input(f"weight{number}", np.float32, shape)
         bias = graph.input(f"bias{number}", np.float32, shape[:1])
         layers.append(TunedLayer(number, folded, input_side(net, number), weight, bias))
@@ -114,16 +109,14 @@ def declare_features(graph: Graph, net: FoldedNet, tuned: int) -> Value:
     return graph.input("features", np.float32, ("crops", input_side(net, number) ** 2, channels))
 
 
-def declare_batch(graph: Graph, net: FoldedNet, tuned: int, with_last_error: bool) -> Batch:
-    """All crops' features, labels and last errors as inputs, and `rows`, which picks a batch."""
-    names = ["labels", "last_error"] if with_last_error else ["labels"]
-    everything = [declare_features(graph, net, tuned)]
-    everything += [graph.input(name, np.float32, ("crops", 3)) for name in names]
+def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
+    """All crops' features and labels as inputs, and `rows`, which picks a batch."""
+    features = declare_features(graph, net, tuned)
+    labels = graph.input("labels", np.float32, ("crops", 3))
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
-    features, labels, *hint = (op.Gather(value, rows, axis=0) for value in everything)
-    size = op.Cast(op.Size(rows), to=TensorProto.FLOAT)
-    return Batch(features, labels, hint[0] if hint else None, op.Reciprocal(size))
+    share = op.Reciprocal(op.Cast(op.Size(rows), to=TensorProto.FLOAT))
+    return Batch(op.Gather(features, rows, axis=0), op.Gather(labels, rows, axis=0), share)
 
 
 def cut_windows(op: Ops, layer: TunedLayer, x: Value) -> Value:

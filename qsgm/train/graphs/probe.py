@@ -6,6 +6,7 @@ import numpy as np
 from onnx import ModelProto
 
 from qsgm.angles import AngleEncoding
+from qsgm.errors import QsgmError
 from qsgm.train.fold import FoldedNet, FoldedSgm
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.layers import (
@@ -23,7 +24,6 @@ from qsgm.train.graphs.sgm import (
     int8_sgm,
     scaled_inputs,
     sgm_inputs,
-    takes_last_error,
 )
 from qsgm.train.graphs.step import backward, forward_all, sgms_behind
 from qsgm.train.graspnet import Loss
@@ -41,14 +41,19 @@ def probe_model(
 
     Inputs are those of :mod:`qsgm.train.graphs.step` without rates and moments. Outputs for every
     SGM's layer k: `true{k}`, `float{k}`, `int8{k}`, each (B, C), and `clipped{k}`, the fraction of
-    the int8 SGM's inputs that lay outside its ranges. With one tuned layer there is no SGM to
-    probe: QsgmError.
+    the int8 SGM's inputs that lay outside its ranges.
+
+    Raises:
+        QsgmError: fewer than two layers are tuned, so that there is no SGM, or one is missing.
     """
+    if tuned < 2:
+        raise QsgmError(
+            f"cannot probe the SGMs of {tuned} tuned layers: the last layer has none; choose 2 or 3"
+        )
     graph = Graph("probe")
     layers = declare_layers(graph, net, tuned)
     sgms_behind(layers, float_sgms), sgms_behind(layers, int8_sgms)
-    with_last_error = any(takes_last_error(float_sgms[layer.number]) for layer in layers[:-1])
-    batch = declare_batch(graph, net, tuned, with_last_error)
+    batch = declare_batch(graph, net, tuned)
     passes = forward_all(graph, layers, batch.features)
     probe_truth(graph, layers, passes, batch, loss)
     for layer, done in zip(layers[:-1], passes[:-1], strict=True):
@@ -85,9 +90,9 @@ def probe_sgm(
     graph: Graph, done: Pass, batch: Batch, float_one: FoldedSgm, int8_one: QuantizedSgm
 ) -> None:
     """Declare `float{k}`, `int8{k}` and `clipped{k}` of one layer."""
-    number, shape = float_one.layer, ("batch", len(float_one.conv2_bias))
+    number, shape = float_one.layer, ("batch", len(float_one.convs[-1].bias))
     op = graph.within(f"float{number}")
-    seen = sgm_inputs(op, float_one, done.after, batch)
+    seen = sgm_inputs(op, done.after, batch)
     graph.output(f"float{number}", float_sgm(op, float_one, seen), np.float32, shape)
     op = graph.within(f"int8{number}")
     scaled = scaled_inputs(op, int8_one, seen)

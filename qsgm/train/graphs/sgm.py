@@ -7,20 +7,15 @@ layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product
 import numpy as np
 
 from qsgm.errors import QsgmError
-from qsgm.train.fold import FoldedSgm
+from qsgm.train.fold import FoldedConv, FoldedSgm
 from qsgm.train.graphs.build import Ops, Value
 from qsgm.train.graphs.layers import Batch
 from qsgm.train.quantize import CLIP_TOLERANCE_STEPS, U8_MAX, QuantizedProduct, QuantizedSgm
 
 
-def takes_last_error(sgm: FoldedSgm | QuantizedSgm) -> bool:
-    """Whether the SGM sees each crop's last error beside its label."""
-    return sgm.extra_channels > 3
-
-
 def sgm_gradient(op: Ops, sgm: FoldedSgm | QuantizedSgm, after: Value, batch: Batch) -> Value:
     """The gradient (B, 1, C) that the SGM gives for an activation (B, 1, C)."""
-    seen = sgm_inputs(op, sgm, after, batch)
+    seen = sgm_inputs(op, after, batch)
     if isinstance(sgm, QuantizedSgm):
         gradient = int8_sgm(op, sgm, scaled_inputs(op, sgm, seen))
     else:
@@ -28,24 +23,26 @@ def sgm_gradient(op: Ops, sgm: FoldedSgm | QuantizedSgm, after: Value, batch: Ba
     return op.Unsqueeze(gradient, op.shape(1))
 
 
-def sgm_inputs(op: Ops, sgm: FoldedSgm | QuantizedSgm, after: Value, batch: Batch) -> Value:
-    """Activation (B, 1, C), label and, if the SGM takes it, last error side by side: (B, Ci)."""
-    seen = [op.Squeeze(after, op.shape(1)), batch.labels]
-    if takes_last_error(sgm):
-        assert batch.last_error is not None
-        seen.append(batch.last_error)
-    return op.Concat(*seen, axis=1)
+def sgm_inputs(op: Ops, after: Value, batch: Batch) -> Value:
+    """Activation (B, 1, C) and label side by side: (B, Ci)."""
+    return op.Concat(op.Squeeze(after, op.shape(1)), batch.labels, axis=1)
 
 
 def float_sgm(op: Ops, sgm: FoldedSgm, seen: Value) -> Value:
-    """Product, ReLU, product. Raises QsgmError for kernels larger than 1x1."""
-    if sgm.conv1_weight.shape[2:] != (1, 1):
+    """Products with ReLU between. Raises QsgmError for kernels larger than 1x1."""
+    x = float_product(op, sgm, sgm.convs[0], seen)
+    for conv in sgm.convs[1:]:
+        x = float_product(op, sgm, conv, op.Relu(x))
+    return x
+
+
+def float_product(op: Ops, sgm: FoldedSgm, conv: FoldedConv, x: Value) -> Value:
+    """x (B, I) to (B, O)."""
+    if conv.weight.shape[2:] != (1, 1):
         raise QsgmError(
             f"the SGM behind layer {sgm.layer} is not 1x1: only layers 4 and 5 have one"
         )
-    weight1, weight2 = sgm.conv1_weight[:, :, 0, 0], sgm.conv2_weight[:, :, 0, 0]
-    hidden = op.Gemm(seen, op.constant(weight1), op.constant(sgm.conv1_bias), transB=1)
-    return op.Gemm(op.Relu(hidden), op.constant(weight2), op.constant(sgm.conv2_bias), transB=1)
+    return op.Gemm(x, op.constant(conv.weight[:, :, 0, 0]), op.constant(conv.bias), transB=1)
 
 
 def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
@@ -54,9 +51,11 @@ def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
 
 
 def int8_sgm(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:
-    """Two integer products (QGemm); the second one's sum leaves as float, so it needs no scale."""
-    hidden = op.Relu(int8_product(op, sgm.first, as_u8(op, scaled)))
-    return int8_product(op, sgm.second, as_u8(op, hidden))
+    """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale."""
+    x = int8_product(op, sgm.products[0], as_u8(op, scaled))
+    for product in sgm.products[1:]:
+        x = int8_product(op, product, as_u8(op, op.Relu(x)))
+    return x
 
 
 def as_u8(op: Ops, x: Value) -> Value:

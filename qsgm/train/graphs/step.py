@@ -1,11 +1,10 @@
 """A whole training step as one graph: layer-local, or by backpropagation as the baseline.
 
-Inputs: `features` (N, P, C), `labels` (N, 3) and, where an SGM takes it, `last_error` (N, 3), of
-all crops; `rows` (B,), the batch; one scalar `rate{k}` per layer; and the state, in which
-`weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the layer's and everything else starts at zero
-(all float32; which inputs are state shows in the outputs' names).
-Outputs: every state under its name with `_next`; `error` (B, 3), d loss / d raw outputs of
-each sample; `loss`, the batch's mean.
+Inputs: `features` (N, P, C) and `labels` (N, 3) of all crops; `rows` (B,), the batch; one scalar
+`rate{k}` per layer; and the state, in which `weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the
+layer's and everything else starts at zero (all float32; which inputs are state shows in the
+outputs' names).
+Outputs: every state under its name with `_next`; `loss`, the batch's mean before the update.
 """
 
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ from qsgm.train.graphs.layers import (
 )
 from qsgm.train.graphs.loss import loss_and_error
 from qsgm.train.graphs.optimizers import Optimizer, Rule
-from qsgm.train.graphs.sgm import sgm_gradient, takes_last_error
+from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graspnet import Loss
 from qsgm.train.quantize import QuantizedSgm
 
@@ -54,7 +53,7 @@ def step_model(
     graph = Graph("local_step")
     layers = declare_layers(graph, net, tuned)
     used = sgms_behind(layers, sgms)
-    batch = declare_batch(graph, net, tuned, any(map(takes_last_error, used.values())))
+    batch = declare_batch(graph, net, tuned)
     rule = optimizer.rule(graph)
     x = batch.features
     for layer in layers[:-1]:
@@ -74,7 +73,7 @@ def backprop_step_model(net: FoldedNet, tuned: int, loss: Loss, optimizer: Optim
     """The same step with true gradients, carried back through all tuned layers."""
     graph = Graph("backprop_step")
     layers = declare_layers(graph, net, tuned)
-    batch = declare_batch(graph, net, tuned, with_last_error=False)
+    batch = declare_batch(graph, net, tuned)
     rule = optimizer.rule(graph)
     passes = forward_all(graph, layers, batch.features)
     error = report_loss(graph.within("loss"), loss, passes[-1], batch)
@@ -115,10 +114,9 @@ def backward(
 
 
 def report_loss(op: Ops, loss: Loss, last: Pass, batch: Batch) -> Value:
-    """Declare the outputs `loss` and `error`; return the error, (B, 1, 3)."""
+    """Declare the output `loss`; return each sample's error, d loss / d raw outputs (B, 1, 3)."""
     mean, error = loss_and_error(op, loss, op.Squeeze(last.after, op.shape(1)), batch.labels)
     op.graph.output("loss", mean, np.float32, ())
-    op.graph.output("error", error, np.float32, ("batch", 3))
     return op.Unsqueeze(error, op.shape(1))
 
 

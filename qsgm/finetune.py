@@ -1,0 +1,408 @@
+"""Fine-tune on one demonstration: crops, features of the frozen layers, feed-forward training.
+
+    frame = read_frame(Path("object.png"))
+    result = finetune(frame, load_bundle(Path("export")))
+    result.save(Path("mug"), name="mug")
+
+The stages stand alone: :func:`prepare` does what all methods share, :func:`train` one run of one
+method on it, so that methods can be compared on the very same crops.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.angles import angle_error, decode_angle, mean_direction
+from qsgm.bundle import (
+    Bundle,
+    Method,
+    OptimizerName,
+    Precision,
+    Recipe,
+    head_file,
+    probe_file,
+    step_file,
+    trunk_file,
+    tuned_layers,
+)
+from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
+from qsgm.errors import QsgmError
+from qsgm.fidelity import LayerFidelity, compare_probe, mean_over_run
+from qsgm.report import finetune_json
+from qsgm.tuned import ObjectDescription, save_object
+from qsgm.tuning import BATCH, StepLoop, tune
+from qsgm.weights import to_conv_layout, to_step_layout
+
+Array = NDArray[np.float32]
+# (stage, how much of it is done, out of how much)
+Watch = Callable[[str, int, int], None]
+
+DEFAULT_EPOCHS = 20
+DEFAULT_LAYERS = 3
+# Crops that are in memory at once.
+SLICE = 50
+DETECTION_THRESHOLD = 0.5
+# More of an SGM's inputs than this outside its ranges: the object is unlike the calibration set.
+NOTABLE_CLIPPING = 0.01
+# What each tunable layer leaves per crop: convolution and ReLU, and the pool's one position.
+OUTPUTS_PER_CROP = {4: 16 * (2 * 25 + 1), 5: 16 * 2, 6: 3}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to tune; what is None is up to the bundle."""
+
+    method: Method = "sgm"
+    precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
+    layers: int = DEFAULT_LAYERS  # how many of the last ones
+    optimizer: OptimizerName | None = None
+    epochs: int = DEFAULT_EPOCHS
+    seed: int = 0
+    center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """On the validation crops."""
+
+    detection_accuracy: float  # share of crops on the right side of 0.5
+    angle_mae_deg: float  # modulo 180 degrees, over positives
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What the gradients were worth before the first step (epoch 0) or after an epoch."""
+
+    epoch: int
+    layers: dict[int, LayerFidelity]  # by SGM layer
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One demonstration as the tuned layers see it."""
+
+    bundle: Bundle
+    settings: Settings
+    features: Array  # (N, P, C), input of the first tuned layer
+    labels: Array  # (N, 3)
+    angle_rad: NDArray[np.float64]  # (N,) of the labels, the offset included
+    offset_rad: float  # the demonstration's orientation as the untouched network sees it
+    offset_strength: float  # 1: all crops agree on it, 0: there is none (a round object)
+    start: dict[str, Array]  # weights and biases, in the step graphs' layout
+    zero_shot: Accuracy
+    seconds: dict[str, float]  # crops, features
+
+
+@dataclass(frozen=True)
+class FinetuneResult:
+    """A tuned object and everything that was measured on the way."""
+
+    prepared: Prepared
+    settings: Settings
+    recipe: Recipe
+    weights: dict[str, Array]  # (Co, Ci, kh, kw) and biases (Co,)
+    accuracy: Accuracy
+    losses: tuple[float, ...]  # mean over each epoch
+    probes: tuple[Probe, ...]
+    seconds: dict[str, float]  # crops, features, tuning, probes, total
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def zero_shot(self) -> Accuracy:
+        """The same crops, by the untouched network."""
+        return self.prepared.zero_shot
+
+    @property
+    def fidelity(self) -> dict[int, LayerFidelity]:
+        """By SGM layer, the mean over the run."""
+        if not self.probes:
+            return {}
+        layers = self.probes[0].layers
+        return {k: mean_over_run([probe.layers[k] for probe in self.probes]) for k in layers}
+
+    @property
+    def peak_activation_bytes(self) -> dict[str, int]:
+        """Layer outputs that have to be alive at once; see :func:`peak_activation_bytes`."""
+        return peak_activation_bytes(self.settings.layers)
+
+    def network(self) -> bytes:
+        """The tuned network as an ONNX file: a frame in, its heatmap out."""
+        return self.prepared.bundle.network_with(self.weights)
+
+    def save(self, folder: Path, name: str, report: Mapping[str, Any] | None = None) -> None:
+        """Write the tuned object for `qsgm predict`; it appears complete or not at all.
+
+        Args:
+            folder: absent, empty or an earlier tuned object.
+            name: what the object is called.
+            report: what goes into report.json; without it, the measured values.
+
+        Raises:
+            QsgmError: the folder cannot be written, or holds something else.
+        """
+        description = ObjectDescription(
+            name, self.prepared.bundle.encoding, self.prepared.offset_rad
+        )
+        values = dict(report) if report is not None else finetune_json(self, name, folder)
+        save_object(folder, description, self.network(), values)
+
+
+def finetune(
+    frame: NDArray[np.uint8],
+    bundle: Bundle,
+    settings: Settings | None = None,
+    watch: Watch | None = None,
+) -> FinetuneResult:
+    """Tune the bundle's network to the object in a demonstration frame (H, W, 3) BGR.
+
+    Raises:
+        QsgmError: the object's window leaves the frame, the bundle cannot do what the settings
+            ask for, or training diverged.
+    """
+    settings = settings or Settings()
+    return train(prepare(frame, bundle, settings, watch), settings, watch)
+
+
+def prepare(
+    frame: NDArray[np.uint8], bundle: Bundle, settings: Settings, watch: Watch | None = None
+) -> Prepared:
+    """Crops, features, labels and what the untouched network makes of them.
+
+    Of the settings only `layers`, `seed`, `center_px` and `threads` matter here.
+    """
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+    if settings.layers > bundle.most_layers:
+        raise QsgmError(
+            f"the bundle {bundle.folder} can tune {bundle.most_layers} layers at most, not "
+            f"{settings.layers}; pass --layers {bundle.most_layers}"
+        )
+    began = time.perf_counter()
+    height, width = frame.shape[:2]
+    center = settings.center_px or (width / 2, height / 2)
+    plan = plan_crops((height, width), center, np.random.default_rng(settings.seed))
+    seconds = {"crops": 0.0, "features": 0.0}
+    features = see(frame, plan, bundle, settings, seconds, watch or _ignore)
+    start = to_step_layout(bundle.start_weights(settings.layers))
+    outputs = answers(features, start, bundle, settings)
+    seen = decode_angle(outputs[:, 1], outputs[:, 2], bundle.encoding)
+    # Validation crops have no say in it.
+    positive = np.flatnonzero(plan.quality[:TRAIN_CROPS] > 0)
+    offset, strength = mean_direction(seen[positive] - plan.turn_rad[positive])
+    labels = label_crops(plan, offset, bundle.encoding)
+    angle = plan.turn_rad.astype(np.float64) + offset
+    seconds["total"] = time.perf_counter() - began
+    return Prepared(
+        bundle,
+        settings,
+        features,
+        labels,
+        angle,
+        offset,
+        strength,
+        start,
+        accuracy_of(outputs[TRAIN_CROPS:], labels[TRAIN_CROPS:], angle[TRAIN_CROPS:], bundle),
+        seconds,
+    )
+
+
+def see(
+    frame: NDArray[np.uint8],
+    plan: CropPlan,
+    bundle: Bundle,
+    settings: Settings,
+    seconds: dict[str, float],
+    watch: Watch,
+) -> Array:
+    """Features (N, P, C) of the planned crops, cut slice by slice: they never all exist."""
+    session = bundle.session(trunk_file(settings.layers), settings.threads)
+    features: Array | None = None
+    for first in range(0, len(plan), SLICE):
+        rows = slice(first, min(first + SLICE, len(plan)))
+        with _adding_to(seconds, "crops"):
+            crops = cut_crops(frame, plan[rows])
+        with _adding_to(seconds, "features"):
+            some = session.run(["features"], {"crops": crops})[0]
+            if features is None:
+                features = np.empty((len(plan), *some.shape[1:]), np.float32)
+            features[rows] = some
+        watch("crops", rows.stop, len(plan))
+    assert features is not None, "a plan has at least one crop"
+    return features
+
+
+def answers(
+    features: Array, weights: Mapping[str, Array], bundle: Bundle, settings: Settings
+) -> Array:
+    """Quality, sine and cosine (N, 3) that the tuned layers give with these weights."""
+    session = bundle.session(head_file(settings.layers), settings.threads)
+    slices = range(0, len(features), SLICE)
+    return np.concatenate(
+        [
+            session.run(["outputs"], {"features": features[i : i + SLICE], **weights})[0]
+            for i in slices
+        ]
+    )
+
+
+def accuracy_of(
+    outputs: Array, labels: Array, angle_rad: NDArray[np.float64], bundle: Bundle
+) -> Accuracy:
+    """Outputs (N, 3) against labels (N, 3) and the angles (N,) that the labels encode."""
+    positive = labels[:, 0] > 0
+    detected = outputs[:, 0] > DETECTION_THRESHOLD
+    angle = decode_angle(outputs[positive, 1], outputs[positive, 2], bundle.encoding)
+    error = np.degrees(angle_error(angle, angle_rad[positive]))
+    return Accuracy(float(np.mean(detected == positive)), float(np.mean(error)))
+
+
+def train(prepared: Prepared, settings: Settings, watch: Watch | None = None) -> FinetuneResult:
+    """One run of one method on a prepared demonstration; what was prepared stays as it is.
+
+    `settings` may differ from those it was prepared with in `method`, `precision`, `optimizer`,
+    `epochs` and `threads`.
+
+    Raises:
+        QsgmError: training diverged, or the bundle lacks the method.
+    """
+    began = time.perf_counter()
+    bundle, layers = prepared.bundle, settings.layers
+    if layers != prepared.settings.layers:
+        raise ValueError(f"prepared for {prepared.settings.layers} layers, not for {layers}")
+    if settings.method == "bp":
+        settings = replace(settings, precision="float")
+    recipe = bundle.recipe(settings.method, layers, settings.optimizer)
+    name = step_file(settings.method, settings.precision, recipe.optimizer, layers)
+    rates = dict(zip(tuned_layers(layers), recipe.rates, strict=True))
+    loop = _GuardedLoop(
+        bundle.session(name, settings.threads),
+        prepared.features,
+        prepared.labels,
+        prepared.start,
+        rates,
+    )
+    prober = _Prober(prepared, settings)
+    losses: list[float] = []
+
+    def after_epoch(epoch: int, loss: float) -> None:
+        losses.append(loss)
+        weights = loop.weights()
+        loop.refuse_unless_finite(all(np.isfinite(w).all() for w in weights.values()), "a weight")
+        prober(epoch, weights)
+        (watch or _ignore)("tuning", epoch, settings.epochs)
+
+    prober(0, prepared.start)
+    setup = time.perf_counter()
+    before = prober.seconds
+    # Methods with the same seed see the same batches in the same order.
+    tune(loop, TRAIN_CROPS, settings.epochs, np.random.default_rng([settings.seed, 1]), after_epoch)
+    tuning = time.perf_counter() - setup - (prober.seconds - before)
+    weights = loop.weights()
+    validation = slice(TRAIN_CROPS, None)
+    accuracy = accuracy_of(
+        answers(prepared.features[validation], weights, bundle, settings),
+        prepared.labels[validation],
+        prepared.angle_rad[validation],
+        bundle,
+    )
+    seconds = prepared.seconds | {"tuning": tuning, "probes": prober.seconds}
+    seconds["total"] = prepared.seconds["total"] + time.perf_counter() - began
+    result = FinetuneResult(
+        prepared,
+        settings,
+        recipe,
+        to_conv_layout(weights, bundle.start_weights(layers)),
+        accuracy,
+        tuple(losses),
+        tuple(prober.probes),
+        seconds,
+    )
+    return replace(result, warnings=drift_warnings(result))
+
+
+def drift_warnings(result: FinetuneResult) -> tuple[str, ...]:
+    """One line for every SGM that saw much beyond its calibrated ranges."""
+    if (result.settings.method, result.settings.precision) != ("sgm", "int8"):
+        return ()
+    return tuple(
+        f"layer {k}: {100 * layer.clipped_fraction:.1f} % of what its int8 SGM saw lies outside "
+        f"the calibrated ranges: this object is unlike the calibration set; compare with --float"
+        for k, layer in result.fidelity.items()
+        if layer.clipped_fraction > NOTABLE_CLIPPING
+    )
+
+
+def peak_activation_bytes(layers: int, batch: int = BATCH) -> dict[str, int]:
+    """Bytes of layer outputs that have to be alive at once while the last `layers` are trained.
+
+    Counted as the paper's Table 3 does, in float32: a layer's convolution, ReLU and pool (its
+    batchnorm is folded here). Backpropagation keeps those of all layers for the way back. With
+    SGMs a layer is done before the next one runs, so it is the largest layer's. Windows, weights
+    and features are not counted; both methods need them.
+    """
+    outputs = [4 * batch * OUTPUTS_PER_CROP[k] for k in tuned_layers(layers)]
+    return {"sgm": max(outputs), "backprop": sum(outputs)}
+
+
+class _GuardedLoop(StepLoop):
+    """Stops at the first step that leaves the realm of numbers."""
+
+    steps = 0
+
+    def step(self, rows: NDArray[np.int64]) -> float:
+        loss = super().step(rows)
+        self.steps += 1
+        self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
+        return loss
+
+    def refuse_unless_finite(self, finite: bool, what: str) -> None:
+        if not finite:
+            raise QsgmError(
+                f"tuning diverged: {what} is not finite at step {self.steps}; nothing was written. "
+                f"Try another --method or --optimizer, or a frame with the object at its centre"
+            )
+
+
+class _Prober:
+    """Compares gradients on one random training batch at a time and keeps what it finds."""
+
+    def __init__(self, prepared: Prepared, settings: Settings) -> None:
+        began = time.perf_counter()
+        self.probes: list[Probe] = []
+        self._layers = prepared.bundle.sgm_layers(settings.layers)
+        self._rng = np.random.default_rng([settings.seed, 2])
+        self._session = None
+        name = probe_file(settings.layers)
+        if self._layers and name in prepared.bundle.manifest["files"]:
+            self._session = prepared.bundle.session(name, settings.threads)
+        self._data = {"features": prepared.features, "labels": prepared.labels}
+        self.seconds = time.perf_counter() - began
+
+    def __call__(self, epoch: int, weights: Mapping[str, Array]) -> None:
+        if self._session is None:
+            return
+        began = time.perf_counter()
+        rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
+        names = [output.name for output in self._session.get_outputs()]
+        values = self._session.run(names, {**self._data, "rows": rows, **weights})
+        outputs = dict(zip(names, values, strict=True))
+        self.probes.append(Probe(epoch, compare_probe(outputs, self._layers)))
+        self.seconds += time.perf_counter() - began
+
+
+@contextmanager
+def _adding_to(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    seconds[stage] += time.perf_counter() - began
+
+
+def _ignore(_stage: str, _done: int, _of: int) -> None:
+    """Watch nothing."""

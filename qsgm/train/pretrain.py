@@ -1,0 +1,261 @@
+"""`qsgm pretrain`: from nothing to `sgm.pt`, in four stages, resumable.
+
+1. backbone: GraspNet learns drawn objects by backpropagation.
+2. matching: the SGMs regress true gradients.
+3. meta: MAML with the SGMs as the update rule, three layers tuned.
+4. rates: for fewer tuned layers, the best of a few, on drawn objects of their own.
+
+What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
+command with the same seed.
+"""
+
+import platform
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import qsgm
+from qsgm.errors import QsgmError
+from qsgm.train.backbone import BackboneConfig, BackboneTraining, in_memory_format
+from qsgm.train.checkpoint import Checkpoint, save_checkpoint
+from qsgm.train.evaluate import Score, best_rates, run_sgms
+from qsgm.train.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.local import columns, layer_forward
+from qsgm.train.maml import MamlConfig, MetaTraining, OuterFigures
+from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.partial import Partial
+from qsgm.train.sgm import Sgm
+from qsgm.train.start import folded_start, write_back
+from qsgm.train.tasks import TaskSet, draw_tasks, start_states
+
+TUNED = 3
+# Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
+# for its SGM to know what they do (design findings 5 and 7).
+FIRST_RATES = (5e-3, 1e-3, 3e-3)
+RATE_GRID = (1e-3, 3e-3, 1e-2, 3e-2)
+SAVE_EVERY = 100
+
+# stage, steps done, steps in all, figures worth showing
+Watch = Callable[[str, int, int, dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Sizes of all stages; the defaults make the shipped checkpoint."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    tasks: int = 200
+    crops_per_task: int = 400
+    trial_tasks: int = 16
+    trial_epochs: int = 10
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    maml: MamlConfig = field(default_factory=MamlConfig)
+
+
+def pretrain(
+    output: Path,
+    seed: int,
+    device: str,
+    watch: Watch,
+    config: PretrainConfig | None = None,
+    loss: Loss | None = None,
+) -> Checkpoint:
+    """Pretrain and write `output`.
+
+    Args:
+        output: `sgm.pt`.
+        seed: of everything drawn at random.
+        device: `cpu` or `cuda`, for the backbone; the rest is small and stays on the CPU.
+        watch: told about progress.
+        config: sizes; the default makes the shipped checkpoint.
+        loss: and with it the angle encoding.
+
+    Raises:
+        QsgmError: the device is not there, or training ended in NaN.
+    """
+    config, loss = config or PretrainConfig(), loss or Loss()
+    _check_device(device)
+    started = perf_counter()
+    partial = Partial.open(output, {"seed": seed, "config": repr(config), "loss": repr(loss)})
+    net = _backbone(partial, config, loss, seed, device, watch)
+    tasks = _draw(net, config.tasks, config.crops_per_task, seed + 1, loss, watch)
+    sgms = _match(partial, net, tasks, config, loss, seed, watch)
+    rates = _meta_train(partial, net, sgms, tasks, config, loss, seed, watch)
+    trial = _draw(net, config.trial_tasks, config.crops_per_task, seed + 2, loss, watch)
+    all_rates, score = _choose_rates(net, sgms, rates, trial, config, loss, watch)
+    card = _card(seed, config, score, perf_counter() - started, partial.resumed)
+    checkpoint = Checkpoint(net, sgms, loss, all_rates, card)
+    save_checkpoint(output, checkpoint)
+    partial.remove()
+    return checkpoint
+
+
+def _backbone(
+    partial: Partial, config: PretrainConfig, loss: Loss, seed: int, device: str, watch: Watch
+) -> GraspNet:
+    training = BackboneTraining(config.backbone, loss, seed, device)
+    if "net" in partial.data:
+        training.net.load_state_dict(partial.data["net"])
+        return _portable(training.net)
+    if "backbone" in partial.data:
+        training.resume(partial.data["backbone"])
+    mean = 0.0
+
+    def after_step(step: int, value: float) -> None:
+        nonlocal mean
+        mean = value if mean == 0.0 else 0.98 * mean + 0.02 * value
+        watch("backbone", step, config.backbone.steps, {"loss": mean})
+        if step % SAVE_EVERY == 0:
+            partial.save(backbone=training.state())
+
+    net = _portable(training.run(after_step))
+    partial.save(backbone=None, net=net.state_dict())
+    return net
+
+
+def _portable(net: GraspNet) -> GraspNet:
+    """On the CPU, in the usual layout, in eval mode."""
+    return in_memory_format(net.cpu(), torch.contiguous_format).eval()
+
+
+def _draw(net: GraspNet, count: int, crops: int, seed: int, loss: Loss, watch: Watch) -> TaskSet:
+    done = 0
+
+    def after_task() -> None:
+        nonlocal done
+        done += 1
+        watch("tasks", done, count, {})
+
+    return draw_tasks(net, count, crops, seed, loss, after_task)
+
+
+def _match(
+    partial: Partial,
+    net: GraspNet,
+    tasks: TaskSet,
+    config: PretrainConfig,
+    loss: Loss,
+    seed: int,
+    watch: Watch,
+) -> dict[int, Sgm]:
+    torch.manual_seed(seed + 3)
+    sgms = {layer: Sgm(layer, config.hidden) for layer in range(LAYERS + 1 - TUNED, LAYERS)}
+    if "sgms" in partial.data:
+        for layer, sgm in sgms.items():
+            sgm.load_state_dict(partial.data["sgms"][layer])
+        return {layer: sgm.eval() for layer, sgm in sgms.items()}
+    # Layers 5 and 6 hold still here: what layer 4's SGM regresses is then a function of its input.
+    rates = (2 * FIRST_RATES[0], 0.0, 0.0)
+    start = folded_start(net, TUNED)
+    examples = record_examples(tasks, start, rates, loss, config.matching, seed)
+    done, total = 0, len(sgms) * config.matching.fit_steps
+
+    def after_step() -> None:
+        nonlocal done
+        done += 1
+        watch("matching", done, total, {})
+
+    for layer, sgm in sgms.items():
+        fit_sgm(sgm, examples[layer], config.matching, seed + layer, after_step)
+    partial.save(sgms={layer: sgm.state_dict() for layer, sgm in sgms.items()})
+    return sgms
+
+
+def _meta_train(
+    partial: Partial,
+    net: GraspNet,
+    sgms: dict[int, Sgm],
+    tasks: TaskSet,
+    config: PretrainConfig,
+    loss: Loss,
+    seed: int,
+    watch: Watch,
+) -> tuple[float, ...]:
+    start = folded_start(net, TUNED)
+    training = MetaTraining(config.maml, loss, tasks, start, sgms, FIRST_RATES, seed)
+    if "meta" in partial.data:
+        training.resume(partial.data["meta"])
+    mean: dict[str, float] = {}
+
+    def after_step(step: int, figures: OuterFigures) -> None:
+        now = {"query": figures.query_loss}
+        now |= {f"cos{layer}": value for layer, value in figures.cosine.items()}
+        for name, value in now.items():
+            if value == value:
+                mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
+        watch("meta", step, config.maml.outer_steps, dict(mean))
+        if step % SAVE_EVERY == 0:
+            partial.save(meta=training.state())
+
+    training.run(after_step)
+    write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
+    return tuple(float(rate) for rate in training.log_rates.detach().exp())
+
+
+def _choose_rates(
+    net: GraspNet,
+    sgms: dict[int, Sgm],
+    meta_rates: tuple[float, ...],
+    trial: TaskSet,
+    config: PretrainConfig,
+    loss: Loss,
+    watch: Watch,
+) -> tuple[dict[int, tuple[float, ...]], Score]:
+    """Rates for one and two tuned layers by trial; those for three come from meta-training."""
+    rates = {TUNED: meta_rates}
+    done, total = 0, len(RATE_GRID) + len(RATE_GRID) ** 2
+    for tuned in range(1, TUNED):
+        features = _features_behind(folded_start(net, TUNED), TUNED - tuned, trial)
+        start = folded_start(net, tuned)
+
+        def run(candidate: tuple[float, ...]) -> Score:
+            nonlocal done
+            done += 1
+            watch("rates", done, total, {})
+            return run_sgms(start, sgms, candidate, features, config.trial_epochs, loss)  # noqa: B023
+
+        rates[tuned] = best_rates(product(RATE_GRID, repeat=tuned), run)
+    score = run_sgms(
+        folded_start(net, TUNED), sgms, meta_rates, trial, 2 * config.trial_epochs, loss
+    )
+    return dict(sorted(rates.items())), score
+
+
+@torch.no_grad()
+def _features_behind(start: list[tuple[Tensor, Tensor]], layers: int, tasks: TaskSet) -> TaskSet:
+    """The same tasks, seen from behind the first `layers` of the tuned layers."""
+    states = start_states(start, 1)
+    features = []
+    for chunk in tasks.chunks(1):
+        x = chunk.features.float()
+        for number, state in list(enumerate(states, LAYERS + 1 - len(states)))[:layers]:
+            _, x = layer_forward(number, state, columns(number, x))
+        features.append(x)
+    return TaskSet(torch.cat(features), tasks.labels, tasks.support)
+
+
+def _check_device(device: str) -> None:
+    if device == "cuda" and not torch.cuda.is_available():
+        raise QsgmError("--device cuda: torch sees no CUDA device here; use --device cpu")
+
+
+def _card(
+    seed: int, config: PretrainConfig, score: Score, seconds: float, resumed: bool
+) -> dict[str, Any]:
+    return {
+        "command": f"qsgm pretrain -o sgm.pt --seed {seed}",
+        "qsgm": qsgm.__version__,
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "seconds": round(seconds),
+        "resumed": resumed,
+        "config": asdict(config),
+        "drawn_objects": {name: round(value, 4) for name, value in asdict(score).items()},
+    }

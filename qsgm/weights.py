@@ -1,0 +1,17 @@
+"""A convolution's weight in its two layouts: ONNX's Conv and the training steps' product."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+def to_step_layout(weight: Array) -> Array:
+    """(Co, Ci, kh, kw) to (Co, kh * kw * Ci), the order in which a step cuts its windows."""
+    return np.ascontiguousarray(weight.transpose(0, 2, 3, 1).reshape(len(weight), -1))
+
+
+def to_conv_layout(weight: Array, kernel: int) -> Array:
+    """(Co, kernel * kernel * Ci) back to (Co, Ci, kernel, kernel)."""
+    windows = weight.reshape(len(weight), kernel, kernel, -1)
+    return np.ascontiguousarray(windows.transpose(0, 3, 1, 2))
