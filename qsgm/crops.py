@@ -157,9 +157,10 @@ def _ring(
     """Points (N, 2) [px] in a ring around the object."""
     direction = rng.uniform(-np.pi, np.pi, count)
     radius = rng.uniform(NEGATIVE_DISTANCE_PX, NEAR_MISS_DISTANCE_PX, count)
-    return np.asarray(center_px) + radius[:, None] * np.stack(
+    offset: NDArray[np.float64] = radius[:, None] * np.stack(
         [np.cos(direction), np.sin(direction)], axis=-1
     )
+    return offset + np.asarray(center_px)
 
 
 def _anywhere(
@@ -175,7 +176,8 @@ def _inside(centers: NDArray[np.float64], frame_hw: tuple[int, int]) -> NDArray[
     """Window centres (N, 2) [px] moved so far that the windows lie inside the frame."""
     height, width = frame_hw
     high = np.array([width - HALF_CROP_PX, height - HALF_CROP_PX], dtype=np.float64)
-    return np.clip(centers, HALF_CROP_PX, high)
+    inside: NDArray[np.float64] = np.clip(centers, HALF_CROP_PX, high)
+    return inside
 
 
 def _color_jitter(rng: np.random.Generator, count: int) -> NDArray[np.float32]:

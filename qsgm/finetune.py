@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +33,8 @@ from qsgm.bundle import (
 from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.errors import QsgmError
 from qsgm.fidelity import LayerFidelity, compare_probe, mean_over_run
-from qsgm.report import finetune_json
-from qsgm.tuned import ObjectDescription, save_object
+from qsgm.report import run_json
+from qsgm.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.tuning import BATCH, StepLoop, tune
 from qsgm.weights import to_conv_layout, to_step_layout
 
@@ -136,22 +135,25 @@ class FinetuneResult:
         """The tuned network as an ONNX file: a frame in, its heatmap out."""
         return self.prepared.bundle.network_with(self.weights)
 
-    def save(self, folder: Path, name: str, report: Mapping[str, Any] | None = None) -> None:
+    def save(self, folder: Path, name: str) -> None:
         """Write the tuned object for `qsgm predict`; it appears complete or not at all.
 
         Args:
             folder: absent, empty or an earlier tuned object.
             name: what the object is called.
-            report: what goes into report.json; without it, the measured values.
 
         Raises:
             QsgmError: the folder cannot be written, or holds something else.
         """
-        description = ObjectDescription(
-            name, self.prepared.bundle.encoding, self.prepared.offset_rad
-        )
-        values = dict(report) if report is not None else finetune_json(self, name, folder)
-        save_object(folder, description, self.network(), values)
+        report = run_json(self, name, folder)
+        save_object(folder, self._description(name), self.network(), report)
+
+    def tuned_object(self, name: str = "object") -> TunedObject:
+        """The tuned object without a detour over the disk."""
+        return TunedObject(self._description(name), self.network(), self.settings.threads)
+
+    def _description(self, name: str) -> ObjectDescription:
+        return ObjectDescription(name, self.prepared.bundle.encoding, self.prepared.offset_rad)
 
 
 def finetune(
@@ -190,7 +192,7 @@ def prepare(
     plan = plan_crops((height, width), center, np.random.default_rng(settings.seed))
     seconds = {"crops": 0.0, "features": 0.0}
     features = see(frame, plan, bundle, settings, seconds, watch or _ignore)
-    start = to_step_layout(bundle.start_weights(settings.layers))
+    start = _in_step_layout(bundle.start_weights(settings.layers))
     outputs = answers(features, start, bundle, settings)
     seen = decode_angle(outputs[:, 1], outputs[:, 2], bundle.encoding)
     # Validation crops have no say in it.
@@ -263,11 +265,17 @@ def accuracy_of(
     return Accuracy(float(np.mean(detected == positive)), float(np.mean(error)))
 
 
-def train(prepared: Prepared, settings: Settings, watch: Watch | None = None) -> FinetuneResult:
+def train(
+    prepared: Prepared, settings: Settings, watch: Watch | None = None, *, probe: bool = True
+) -> FinetuneResult:
     """One run of one method on a prepared demonstration; what was prepared stays as it is.
 
-    `settings` may differ from those it was prepared with in `method`, `precision`, `optimizer`,
-    `epochs` and `threads`.
+    Args:
+        prepared: as :func:`prepare` returned it.
+        settings: may differ from those it was prepared with in `method`, `precision`,
+            `optimizer`, `epochs` and `threads`.
+        watch: told about every epoch.
+        probe: whether to measure the gradients' fidelity.
 
     Raises:
         QsgmError: training diverged, or the bundle lacks the method.
@@ -288,7 +296,7 @@ def train(prepared: Prepared, settings: Settings, watch: Watch | None = None) ->
         prepared.start,
         rates,
     )
-    prober = _Prober(prepared, settings)
+    prober = _Prober(prepared, settings, probe)
     losses: list[float] = []
 
     def after_epoch(epoch: int, loss: float) -> None:
@@ -318,7 +326,7 @@ def train(prepared: Prepared, settings: Settings, watch: Watch | None = None) ->
         prepared,
         settings,
         recipe,
-        to_conv_layout(weights, bundle.start_weights(layers)),
+        _in_conv_layout(weights, bundle.start_weights(layers)),
         accuracy,
         tuple(losses),
         tuple(prober.probes),
@@ -356,8 +364,8 @@ class _GuardedLoop(StepLoop):
 
     steps = 0
 
-    def step(self, rows: NDArray[np.int64]) -> float:
-        loss = super().step(rows)
+    def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
+        loss = super().step(rows, factor)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
         return loss
@@ -373,14 +381,14 @@ class _GuardedLoop(StepLoop):
 class _Prober:
     """Compares gradients on one random training batch at a time and keeps what it finds."""
 
-    def __init__(self, prepared: Prepared, settings: Settings) -> None:
+    def __init__(self, prepared: Prepared, settings: Settings, wanted: bool) -> None:
         began = time.perf_counter()
         self.probes: list[Probe] = []
         self._layers = prepared.bundle.sgm_layers(settings.layers)
         self._rng = np.random.default_rng([settings.seed, 2])
         self._session = None
         name = probe_file(settings.layers)
-        if self._layers and name in prepared.bundle.manifest["files"]:
+        if wanted and self._layers and name in prepared.bundle.manifest["files"]:
             self._session = prepared.bundle.session(name, settings.threads)
         self._data = {"features": prepared.features, "labels": prepared.labels}
         self.seconds = time.perf_counter() - began
@@ -395,6 +403,19 @@ class _Prober:
         outputs = dict(zip(names, values, strict=True))
         self.probes.append(Probe(epoch, compare_probe(outputs, self._layers)))
         self.seconds += time.perf_counter() - began
+
+
+def _in_step_layout(weights: Mapping[str, Array]) -> dict[str, Array]:
+    return {
+        name: to_step_layout(value) if value.ndim > 1 else value for name, value in weights.items()
+    }
+
+
+def _in_conv_layout(weights: Mapping[str, Array], like: Mapping[str, Array]) -> dict[str, Array]:
+    return {
+        name: to_conv_layout(weights[name], value.shape[-1]) if value.ndim > 1 else weights[name]
+        for name, value in like.items()
+    }
 
 
 @contextmanager

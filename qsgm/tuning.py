@@ -28,7 +28,8 @@ class StepLoop:
         rates: Mapping[int, float],  # per tuned layer
     ) -> None:
         self._session = session
-        # Kept here, since bindings use these arrays' memory.
+        self._rates = dict(rates)
+        # Kept here, since bindings read these arrays' memory.
         self._data = {
             "features": np.ascontiguousarray(features, dtype=np.float32),
             "labels": np.ascontiguousarray(labels, dtype=np.float32),
@@ -45,8 +46,13 @@ class StepLoop:
         self._bindings = [self._bind(0, 1), self._bind(1, 0)]
         self._now = 0
 
-    def step(self, rows: NDArray[np.int64]) -> float:
-        """Train on the crops `rows`; returns the batch's mean loss before the update."""
+    def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
+        """Train on the crops `rows`, all rates times `factor`.
+
+        Returns the batch's mean loss before the update.
+        """
+        for layer, rate in self._rates.items():
+            self._data[f"rate{layer}"][...] = factor * rate
         binding = self._bindings[self._now]
         binding.bind_cpu_input("rows", rows)
         self._session.run_with_iobinding(binding)
@@ -81,6 +87,14 @@ def _buffers(arrays: Mapping[str, Array]) -> dict[str, ort.OrtValue]:
     }
 
 
+def rate_factor(step: int, steps: int) -> float:
+    """Linear decay of all rates, from 1 at step 0 to nothing at step `steps`.
+
+    A constant rate leaves the weights wandering about their optimum; this lets them settle.
+    """
+    return 1.0 - step / steps
+
+
 def batches(count: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
     """Rows of every batch of one epoch over `count` crops, shuffled; the last may be smaller."""
     order = rng.permutation(count)
@@ -96,6 +110,10 @@ def tune(
     after_epoch: Callable[[int, float], None],
 ) -> None:
     """Run `epochs` passes over the first `count` crops; `after_epoch` gets its number and loss."""
+    step, steps = 0, epochs * -(-count // BATCH)
     for epoch in range(1, epochs + 1):
-        losses = [loop.step(rows) for rows in batches(count, rng)]
+        losses = []
+        for rows in batches(count, rng):
+            losses.append(loop.step(rows, rate_factor(step, steps)))
+            step += 1
         after_epoch(epoch, float(np.mean(losses)))

@@ -226,7 +226,7 @@ def test_a_hundred_local_steps_equal_torchs(
     start = reference.convs[7 - tuned].weight.detach().clone()
     for rows in batches(100):
         expected_loss = reference.local_step(*picked(data, rows), sgms)
-        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-4)
+        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, rel=1e-3)
     assert_same_weights(exported, reference, 1e-4)
     assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
     assert exported.feeds.get("step", 100) == 100
@@ -243,7 +243,7 @@ def test_a_hundred_backprop_steps_equal_torchs(
     start = reference.convs[7 - tuned].weight.detach().clone()
     for count, rows in enumerate(batches(100), start=1):
         expected_loss = reference.backprop_step(*picked(data, rows))
-        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-4)
+        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, rel=1e-3)
         if count == 1:
             assert_same_weights(exported, reference, 1e-5)
     assert_same_weights(exported, reference, 1e-4)

@@ -64,10 +64,10 @@ class BackboneTraining:
     def resume(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state`; the batches to come are those an unbroken run would see."""
         self.step = state["step"]
-        for part, saved in zip(
-            (self.net, self.optimizer, self.schedule), state["parts"], strict=True
-        ):
-            part.load_state_dict(saved)
+        net, optimizer, schedule = state["parts"]
+        self.net.load_state_dict(net)
+        self.optimizer.load_state_dict(optimizer)
+        self.schedule.load_state_dict(schedule)
 
     def _outputs(self, crops: Tensor) -> Tensor:
         x = normalize(crops.flatten(0, 1).to(self.device))

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import warnings
 import zipfile
 from dataclasses import asdict, dataclass
 from io import BytesIO
@@ -79,7 +80,9 @@ def _read(path: Path) -> Any:
         size = path.stat().st_size // 2**20
         raise QsgmError(f"{path} has {size} MB, a checkpoint has less than 64 MB; {_MEND}")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():  # torch wonders aloud about files that are not its own
+            warnings.simplefilter("ignore")
+            return torch.load(path, map_location="cpu", weights_only=True)
     except (
         pickle.UnpicklingError,
         zipfile.BadZipFile,

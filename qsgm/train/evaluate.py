@@ -1,16 +1,18 @@
 """Whole fine-tuning runs on many tasks in torch: which rates work, and how well."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 
 import torch
 from torch import Tensor
 
 from qsgm.train.graspnet import LAYERS, Loss
 from qsgm.train.local import LayerState, local_step, loss_gradient, outputs
-from qsgm.train.maml import BATCH, MOMENTUM, apply_sgm
+from qsgm.train.maml import MOMENTUM, apply_sgm
 from qsgm.train.sgm import Sgm
-from qsgm.train.tasks import TaskSet, start_states
+from qsgm.train.tasks import TaskSet, shuffled_batches, start_states
+from qsgm.tuning import rate_factor
 
 
 @dataclass(frozen=True)
@@ -40,16 +42,15 @@ def run_sgms(
         return apply_sgm(sgms[layer], activation, labels)
 
     scores = []
-    rate_tensors = [torch.tensor(rate) for rate in rates]
     for chunk in tasks.chunks(8):
-        generator = torch.Generator().manual_seed(seed)
         states = start_states(start, len(chunk))
-        for _ in range(epochs):
-            for rows in torch.randperm(chunk.support, generator=generator).split(BATCH):
-                features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
-                states = local_step(states, features, labels, rate_tensors, gradient_of, MOMENTUM)
+        batches = list(shuffled_batches(chunk.support, epochs, seed))
+        for step, rows in enumerate(batches):
+            features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
+            now = [torch.tensor(rate * rate_factor(step, len(batches))) for rate in rates]
+            states = local_step(states, features, labels, now, gradient_of, MOMENTUM)
         scores.append(score(states, chunk, loss))
-    return torch_mean(scores)
+    return Score(*torch.cat(scores).mean(dim=0).tolist())
 
 
 def score(states: Sequence[LayerState], tasks: TaskSet, loss: Loss) -> Tensor:
@@ -67,15 +68,7 @@ def score(states: Sequence[LayerState], tasks: TaskSet, loss: Loss) -> Tensor:
     return torch.stack([losses.mean(dim=1), detection, angle], dim=1)
 
 
-def torch_mean(scores: Sequence[Tensor]) -> Score:
-    """Mean over the tasks of all chunks."""
-    return Score(*torch.cat(list(scores)).mean(dim=0).tolist())
-
-
-def best_rates(
-    candidates: Iterable[tuple[float, ...]], run: Callable[[tuple[float, ...]], Score]
-) -> tuple[float, ...]:
-    """The candidate whose run ends with the lowest finite loss."""
-    scored = [(run(rates).loss, rates) for rates in candidates]
-    finite = [entry for entry in scored if entry[0] == entry[0]]
-    return min(finite)[1]
+def best_rates(scores: Mapping[tuple[float, ...], Score]) -> tuple[float, ...]:
+    """The rates whose run ended with the lowest finite loss."""
+    finite = {rates: score.loss for rates, score in scores.items() if isfinite(score.loss)}
+    return min(finite, key=lambda rates: finite[rates])

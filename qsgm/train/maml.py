@@ -20,17 +20,17 @@ from qsgm.train.graspnet import LAYERS, Loss
 from qsgm.train.local import LayerState, local_step, loss_gradient, outputs, true_gradients
 from qsgm.train.sgm import Sgm
 from qsgm.train.tasks import TaskSet
+from qsgm.tuning import BATCH
 
 MOMENTUM = 0.9
-BATCH = 32
 
 
 @dataclass(frozen=True)
 class MamlConfig:
     """Sizes and rates of the third stage."""
 
-    outer_steps: int = 1200
-    tasks_per_step: int = 6
+    outer_steps: int = 3000
+    tasks_per_step: int = 8
     unroll: int = 16
     runs_per_task_slot: int = 4  # runs kept going, per task of an outer step
     restart: float = 0.04
@@ -43,7 +43,7 @@ class MamlConfig:
     warm_up: int = 50
 
 
-@dataclass
+@dataclass(eq=False)  # found again by identity
 class Run:
     """One task on its way: its tuned layers' states, `None` before the first step."""
 
@@ -113,7 +113,7 @@ class MetaTraining:
         self._learn(objective.mean())
         self._keep(chosen, unrolled.states, query)
         return OuterFigures(
-            float(query.mean()),
+            float(query.detach().mean()),
             {layer: total / self.config.unroll for layer, total in unrolled.cosine.items()},
             tuple(self.log_rates.detach().exp().tolist()),
         )
@@ -187,7 +187,7 @@ class _Unrolled:
     def __init__(self, training: MetaTraining, chosen: list[Run]) -> None:
         self.training = training
         rows = [run.task for run in chosen]
-        self.features = training.tasks.features[rows].float()  # (T, N, P, C)
+        self.features = training.tasks.features[rows].to(training.log_rates.dtype)  # (T, N, P, C)
         self.labels = training.tasks.labels[rows]  # (T, N, 3)
         self.states = _join([run.states or self._start() for run in chosen])
         self.rates = training.log_rates.exp().unbind()

@@ -5,7 +5,7 @@ where no backpropagation run went (design finding 4), which the third stage, MAM
 from random SGMs instead, that one needs many times longer.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,9 +14,7 @@ from torch import Tensor
 from qsgm.train.graspnet import LAYERS, Loss
 from qsgm.train.local import LayerState, local_step, true_gradients
 from qsgm.train.sgm import Sgm
-from qsgm.train.tasks import TaskSet, start_states
-
-BATCH = 32
+from qsgm.train.tasks import TaskSet, shuffled_batches, start_states
 
 
 @dataclass(frozen=True)
@@ -53,9 +51,8 @@ def record_examples(
     seen: dict[int, list[tuple[Tensor, ...]]] = {layer: [] for layer in layers}
     for chunk in tasks.chunks(8):
         states = start_states(start, len(chunk))
-        generator = torch.Generator().manual_seed(seed)
-        steps = _batches(chunk.support, config.epochs, generator)
-        for number, rows in enumerate(steps):
+        batches = shuffled_batches(chunk.support, config.epochs, seed)
+        for number, rows in enumerate(batches):
             features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
             states, activations, gradients = _backprop_step(states, features, labels, rates, loss)
             if number % config.record_every == 0:
@@ -105,11 +102,6 @@ def _backprop_step(
     rate_tensors = [torch.tensor(rate) for rate in rates]
     states = local_step(states, features, labels, rate_tensors, gradient_of, momentum=0.9)
     return states, activations, gradients
-
-
-def _batches(count: int, epochs: int, generator: torch.Generator) -> Iterator[Tensor]:
-    for _ in range(epochs):
-        yield from torch.randperm(count, generator=generator).split(BATCH)
 
 
 def _stack(parts: list[tuple[Tensor, ...]]) -> Examples:

@@ -3,7 +3,7 @@
 1. backbone: GraspNet learns drawn objects by backpropagation.
 2. matching: the SGMs regress true gradients.
 3. meta: MAML with the SGMs as the update rule, three layers tuned.
-4. rates: for fewer tuned layers, the best of a few, on drawn objects of their own.
+4. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
 
 What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
 command with the same seed.
@@ -38,7 +38,9 @@ TUNED = 3
 # Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
 # for its SGM to know what they do (design findings 5 and 7).
 FIRST_RATES = (5e-3, 1e-3, 3e-3)
-RATE_GRID = (1e-3, 3e-3, 1e-2, 3e-2)
+RATE_GRID = (3e-3, 1e-2, 3e-2, 1e-1)
+# Meta-training's rates are constant, the device's decay: they may start higher.
+META_RATE_FACTORS = (1.0, 1.5, 2.0, 3.0)
 SAVE_EVERY = 100
 
 # stage, steps done, steps in all, figures worth showing
@@ -50,10 +52,10 @@ class PretrainConfig:
     """Sizes of all stages; the defaults make the shipped checkpoint."""
 
     hidden: tuple[int, ...] = (64, 64)
-    tasks: int = 200
+    tasks: int = 300
     crops_per_task: int = 400
     trial_tasks: int = 16
-    trial_epochs: int = 10
+    trial_epochs: int = 40
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     maml: MamlConfig = field(default_factory=MamlConfig)
@@ -208,24 +210,21 @@ def _choose_rates(
     loss: Loss,
     watch: Watch,
 ) -> tuple[dict[int, tuple[float, ...]], Score]:
-    """Rates for one and two tuned layers by trial; those for three come from meta-training."""
-    rates = {TUNED: meta_rates}
-    done, total = 0, len(RATE_GRID) + len(RATE_GRID) ** 2
-    for tuned in range(1, TUNED):
-        features = _features_behind(folded_start(net, TUNED), TUNED - tuned, trial)
-        start = folded_start(net, tuned)
-
-        def run(candidate: tuple[float, ...]) -> Score:
-            nonlocal done
+    """The best rates for every number of tuned layers, and how well those for the most do."""
+    candidates = {tuned: list(product(RATE_GRID, repeat=tuned)) for tuned in range(1, TUNED)}
+    candidates[TUNED] = [tuple(f * rate for rate in meta_rates) for f in META_RATE_FACTORS]
+    done, total = 0, sum(map(len, candidates.values()))
+    rates: dict[int, tuple[float, ...]] = {}
+    scores: dict[tuple[float, ...], Score] = {}
+    for tuned, choices in candidates.items():
+        tasks = _features_behind(folded_start(net, TUNED), TUNED - tuned, trial)
+        for choice in choices:
+            start = folded_start(net, tuned)
+            scores[choice] = run_sgms(start, sgms, choice, tasks, config.trial_epochs, loss)
             done += 1
-            watch("rates", done, total, {})
-            return run_sgms(start, sgms, candidate, features, config.trial_epochs, loss)  # noqa: B023
-
-        rates[tuned] = best_rates(product(RATE_GRID, repeat=tuned), run)
-    score = run_sgms(
-        folded_start(net, TUNED), sgms, meta_rates, trial, 2 * config.trial_epochs, loss
-    )
-    return dict(sorted(rates.items())), score
+            watch("rates", done, total, {"loss": scores[choice].loss})
+        rates[tuned] = best_rates({choice: scores[choice] for choice in choices})
+    return rates, scores[rates[TUNED]]
 
 
 @torch.no_grad()

@@ -19,6 +19,7 @@ from qsgm.crops import CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.train.graspnet import LAYERS, GraspNet, Loss, normalize
 from qsgm.train.local import LayerState
 from qsgm.train.objects import draw_frame
+from qsgm.tuning import BATCH
 
 CENTER_PX = (320.0, 240.0)
 FRAME_HW = (480, 640)
@@ -118,6 +119,13 @@ class TaskSet:
         for start in range(0, len(self), size):
             rows = slice(start, start + size)
             yield TaskSet(self.features[rows], self.labels[rows], self.support)
+
+
+def shuffled_batches(count: int, epochs: int, seed: int) -> Iterator[Tensor]:
+    """Rows of every batch of `epochs` passes over `count` crops."""
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(epochs):
+        yield from torch.randperm(count, generator=generator).split(BATCH)
 
 
 def draw_tasks(

@@ -4,10 +4,14 @@ A wrong pattern runs all the same, in float and slowly: look before shipping.
 """
 
 import tempfile
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import onnx
 import onnxruntime as ort
+
+from qsgm.errors import QsgmError
 
 INTEGER_OPERATORS = frozenset({"QGemm", "QLinearConv", "QLinearMatMul", "MatMulIntegerToFloat"})
 
@@ -25,3 +29,23 @@ def optimized_nodes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
 def integer_operators(model: onnx.ModelProto) -> list[str]:
     """Type of every operator that computes products in integers, one entry per node."""
     return [node.op_type for node in optimized_nodes(model) if node.op_type in INTEGER_OPERATORS]
+
+
+def refuse_float_products(name: str, model: onnx.ModelProto) -> None:
+    """Raise QsgmError unless every product of rounded inputs is computed in integers.
+
+    `name` is the graph's, for the message.
+    """
+    rounded = by_layer(model.graph.node, {"QuantizeLinear"})
+    integer = by_layer(optimized_nodes(model), INTEGER_OPERATORS)
+    for layer, expected in sorted(rounded.items()):
+        if integer[layer] != expected:
+            raise QsgmError(
+                f"{name}: ONNX Runtime {ort.__version__} computes {integer[layer]} of the"
+                f" {expected} int8 products of {layer} in integers; install another version"
+            )
+
+
+def by_layer(nodes: Iterable[onnx.NodeProto], op_types: frozenset[str] | set[str]) -> Counter[str]:
+    """How many nodes of these types each layer has: the first part of a node's name."""
+    return Counter(node.name.partition("/")[0] for node in nodes if node.op_type in op_types)

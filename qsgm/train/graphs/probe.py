@@ -91,10 +91,10 @@ def probe_sgm(
 ) -> None:
     """Declare `float{k}`, `int8{k}` and `clipped{k}` of one layer."""
     number, shape = float_one.layer, ("batch", len(float_one.convs[-1].bias))
-    op = graph.within(f"float{number}")
+    op = graph.within(f"layer{number}/float")
     seen = sgm_inputs(op, done.after, batch)
     graph.output(f"float{number}", float_sgm(op, float_one, seen), np.float32, shape)
-    op = graph.within(f"int8{number}")
+    op = graph.within(f"layer{number}/int8")
     scaled = scaled_inputs(op, int8_one, seen)
     graph.output(f"int8{number}", int8_sgm(op, int8_one, scaled), np.float32, shape)
     graph.output(f"clipped{number}", clipped_fraction(op, scaled), np.float32, ())

@@ -1,0 +1,9 @@
+"""Measure on folders of frames what the README states.
+
+frames    a folder of demonstrations, with or without a manifest
+accuracy  untouched, synthetic gradients in int8 and float, backpropagation: same crops, same seed
+staging   scenes made from a demonstration: the object elsewhere, turned, in other light, or gone
+scenes    teach on a frame, find the object in such scenes
+speed     seconds per stage in processes of their own, next to the same job in torch
+torchjob  that job
+"""

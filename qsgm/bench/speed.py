@@ -1,0 +1,156 @@
+"""Seconds per stage of the whole job, in processes of their own, next to the same job in torch.
+
+Every variant runs several times, in turns, so that whatever else the machine does hits all of
+them; medians are reported. Ratios are what can be compared between machines.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+
+from qsgm.bundle import Bundle, head_file
+from qsgm.crops import TRAIN_CROPS
+from qsgm.errors import QsgmError
+from qsgm.finetune import Prepared, Settings, Watch, prepare
+from qsgm.images import read_demonstration
+from qsgm.report import number, plain_table
+from qsgm.tuning import BATCH
+
+VARIANTS: Mapping[str, Sequence[str]] = {
+    "sgm int8": ("--method", "sgm", "--int8"),
+    "sgm float": ("--method", "sgm", "--float"),
+    "bp": ("--method", "bp"),
+}
+TORCH = "torch bp"
+STAGES = ("crops", "features", "tuning", "total", "process")
+
+Seconds = dict[str, float]
+
+
+def measure_speed(
+    frame: Path, bundle: Bundle, settings: Settings, repeats: int, watch: Watch
+) -> dict[str, Any]:
+    """Medians of all variants and the ratios between them; torch where it is installed."""
+    with_torch = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
+    variants = [*VARIANTS, TORCH] if with_torch else [*VARIANTS]
+    runs: dict[str, list[Seconds]] = {name: [] for name in variants}
+    for repeat in range(repeats):
+        for done, name in enumerate(variants, start=1):
+            runs[name].append(run_once(name, frame, bundle, settings))
+            watch("runs", repeat * len(variants) + done, repeats * len(variants))
+    medians = {
+        name: {stage: median(run[stage] for run in some) for stage in STAGES}
+        for name, some in runs.items()
+    }
+    steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
+    forward = forward_seconds(prepare(read_demonstration(frame), bundle, settings))
+    return {
+        "frame": str(frame),
+        "bundle": str(bundle.folder),
+        "layers": settings.layers,
+        "epochs": settings.epochs,
+        "threads": settings.threads,
+        "repeats": repeats,
+        "steps": steps,
+        "seconds": {
+            name: {stage: number(value, 4) for stage, value in stages.items()}
+            for name, stages in medians.items()
+        },
+        "step_ms": {
+            name: number(1000 * stages["tuning"] / steps, 4) for name, stages in medians.items()
+        },
+        "forward_ms": number(1000 * forward, 4),
+        "ratios": ratios(medians, forward * steps),
+    }
+
+
+def ratios(medians: Mapping[str, Seconds], forward: float) -> dict[str, float | None]:
+    """`forward` is the time of as many forward passes of the tuned layers as there were steps."""
+    own, floating, bp = (medians[name] for name in VARIANTS)
+    found = {
+        "qsgm_step_over_forward": own["tuning"] / forward,
+        "int8_step_over_float_step": own["tuning"] / floating["tuning"],
+        "bp_step_over_qsgm_step": bp["tuning"] / own["tuning"],
+    }
+    if TORCH in medians:
+        other = medians[TORCH]
+        found |= {
+            "torch_bp_step_over_qsgm_step": other["tuning"] / own["tuning"],
+            "torch_features_over_qsgm_features": other["features"] / own["features"],
+            "torch_process_over_qsgm_process": other["process"] / own["process"],
+        }
+    return {name: number(value, 3) for name, value in found.items()}
+
+
+def run_once(name: str, frame: Path, bundle: Bundle, settings: Settings) -> Seconds:
+    """One variant in a process of its own: its stages' seconds, and the process's from outside."""
+    folder = bundle.folder.resolve()
+    layers, epochs, seed, threads = (
+        str(value) for value in (settings.layers, settings.epochs, settings.seed, settings.threads)
+    )
+    with tempfile.TemporaryDirectory() as home:
+        if name == TORCH:
+            job = ["qsgm.bench.torchjob", str(frame), str(folder), layers, epochs, seed, threads]
+        else:
+            job = ["qsgm.cli", "finetune", "--json", "-o", f"{home}/object", *VARIANTS[name]]
+            job += ["--layers", layers, "--epochs", epochs, "--seed", seed, "--threads", threads]
+            job += ["--bundle", str(folder), "--", str(frame)]
+        began = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", *job],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | {"XDG_DATA_HOME": home, "OMP_NUM_THREADS": threads},
+        )
+        process = time.perf_counter() - began
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        raise QsgmError(f"{name} failed with exit code {done.returncode}: {lines[-1]}")
+    seconds: Seconds = json.loads(done.stdout)["seconds"]
+    return seconds | {"process": process}
+
+
+def forward_seconds(prepared: Prepared, repeats: int = 5) -> float:
+    """Seconds of one forward pass of the tuned layers on one batch."""
+    settings = prepared.settings
+    session = prepared.bundle.session(head_file(settings.layers), settings.threads)
+    feeds = {"features": np.ascontiguousarray(prepared.features[:BATCH]), **prepared.start}
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(20):
+            session.run(["outputs"], feeds)
+        times.append((time.perf_counter() - began) / 20)
+    return median(times)
+
+
+def render(report: Mapping[str, Any]) -> RenderableType:
+    """Seconds per stage and variant, and the ratios below them."""
+    table = plain_table(
+        f"seconds, median of {report['repeats']}: last {report['layers']} layers, "
+        f"{report['steps']} steps, threads: {report['threads']}"
+    )
+    table.add_column("")
+    for stage in STAGES:
+        table.add_column(stage, justify="right")
+    table.add_column("ms a step", justify="right")
+    for name, stages in report["seconds"].items():
+        cells = [f"{stages[stage]:.2f}" for stage in STAGES]
+        table.add_row(name, *cells, f"{report['step_ms'][name]:.3f}")
+    quotients = plain_table("ratios")
+    quotients.show_header = False
+    for name, value in report["ratios"].items():
+        quotients.add_row(name.replace("_", " "), f"{value:.2f}")
+    return Group(table, quotients)

@@ -1,0 +1,508 @@
+"""The command line. Results go to stdout, progress to stderr; errors are one line.
+
+Exit codes: 0 done, 1 what was given cannot be used, 2 the command was called wrongly,
+130 interrupted.
+"""
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from qsgm import __version__, paths
+from qsgm.errors import QsgmError
+
+if TYPE_CHECKING:
+    from qsgm.bundle import Bundle
+    from qsgm.finetune import FinetuneResult, Settings
+
+EXIT_BAD_INPUT = 1
+EXIT_INTERRUPTED = 130
+# UsageError; typer keeps it in another place in every other version.
+USAGE_ERROR = cast(type[Exception], typer.BadParameter.__base__)
+HOST_LIBRARIES = ("torch", "onnx", "onnxscript")
+
+# (stage, done, of how many, values to show)
+Watch = Callable[..., None]
+
+
+class MethodName(StrEnum):
+    """Where the tuned layers get their gradients from."""
+
+    SGM = "sgm"
+    BP = "bp"
+
+
+class OptimizerChoice(StrEnum):
+    """What is done with the gradients."""
+
+    SGD = "sgd"
+    ADAM = "adam"
+
+
+class Device(StrEnum):
+    """Where pretraining runs."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+app = typer.Typer(
+    name="qsgm",
+    help="Fine-tune a network on the device, feed-forward, with int8 synthetic gradients.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+bench = typer.Typer(help="Measure what the README states.")
+app.add_typer(bench, name="bench")
+
+FrameArgument = Annotated[
+    Path, typer.Argument(metavar="OBJECT.PNG", help="One frame with the object at its centre.")
+]
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at.")]
+BundleOption = Annotated[
+    Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
+]
+PrecisionOption = Annotated[
+    bool | None,
+    typer.Option("--int8/--float", help="Precision of the SGMs.", show_default="int8"),
+]
+MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
+LayersOption = Annotated[int, typer.Option(min=1, max=3, help="How many of the last to tune.")]
+OptimizerOption = Annotated[
+    OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
+]
+EpochsOption = Annotated[int, typer.Option(min=0, max=10_000, help="Passes over 800 crops.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Of everything drawn at random.")]
+CenterOption = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y", help="Object's centre in px; default: the frame's centre."),
+]
+ThreadsOption = Annotated[int, typer.Option(min=1, max=256, help="Of ONNX Runtime.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+FramesOption = Annotated[
+    Path | None,
+    typer.Option("--frames", metavar="DIR", help="Demonstrations; default: the calibration set."),
+]
+LimitOption = Annotated[int | None, typer.Option(min=1, help="At most so many of the frames.")]
+ReportOption = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Also write the JSON here.")
+]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"qsgm {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    """Fine-tune a network on the device, feed-forward, with int8 synthetic gradients."""
+
+
+@app.command()
+def pretrain(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE")] = Path("sgm.pt"),
+    seed: SeedOption = 0,
+    device: Annotated[Device, typer.Option(help="For the backbone.")] = Device.CPU,
+    as_json: JsonOption = False,
+) -> None:
+    """Pretrain network and SGMs on drawn objects (host; needs torch)."""
+    host = _host_module("qsgm.train.pretrain")
+    with _progress() as watch:
+        host.pretrain(output, seed, device.value, watch)
+    if as_json:
+        _print_json({"output": str(output), "seed": seed, "device": device.value})
+    else:
+        typer.echo(f"pretrained: {output}")
+
+
+@app.command("draw-calibration")
+def draw_calibration(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("calib"),
+    count: Annotated[int | None, typer.Option(min=1, max=10_000, help="Frames.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything drawn at random.")] = None,
+) -> None:
+    """Draw a calibration set and the demo's two pictures (host)."""
+    host = _host_module("qsgm.train.draw_calibration")
+    with _progress() as watch:
+        host.draw_calibration_set(
+            output,
+            host.DEFAULT_COUNT if count is None else count,
+            host.DEFAULT_SEED if seed is None else seed,
+            watch,
+        )
+    typer.echo(f"calibration set: {output}")
+
+
+@app.command("fold-and-quantize")
+def fold_and_quantize(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="SGM.PT", help="What `qsgm pretrain` wrote.")
+    ],
+    calib: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("export"),
+    as_json: JsonOption = False,
+) -> None:
+    """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
+    host = _host_module("qsgm.train.export")
+    with _progress() as watch:
+        report = host.fold_and_quantize(checkpoint, paths.calibration_folder(calib), output, watch)
+    _show(report.to_json(), report, as_json)
+
+
+@app.command()
+def finetune(
+    frame: FrameArgument,
+    int8: PrecisionOption = None,
+    method: MethodOption = MethodName.SGM,
+    layers: LayersOption = 3,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = 20,
+    seed: SeedOption = 0,
+    center: CenterOption = None,
+    bundle: BundleOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Default: among this user's objects."),
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Tune the network to the object in one frame, on the device."""
+    from qsgm.files import check_replaceable
+    from qsgm.report import finetune_json, finetune_report
+    from qsgm.tuned import DESCRIPTION
+
+    settings = _settings(int8, method, layers, optimizer, epochs, seed, center, threads)
+    folder = paths.object_folder(frame) if output is None else output
+    check_replaceable(folder, DESCRIPTION)
+    result = _finetune(frame, _bundle(bundle), settings)
+    name = folder.name if output is None else frame.stem
+    report = finetune_json(result, name, folder)
+    result.save(folder, name)
+    _remember(folder, chosen=output is not None)
+    _show(report, finetune_report(result, name), as_json)
+    if not as_json:
+        typer.echo(f"tuned object: {folder}")
+
+
+@app.command()
+def predict(
+    scene: SceneArgument,
+    tuned: Annotated[
+        Path | None,
+        typer.Option("--object", metavar="DIR", help="Tuned object; default: the last one."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the tuned object: where it is, how far to move, how far to turn."""
+    from qsgm.images import read_frame, write_png
+    from qsgm.pictures import draw_detection
+    from qsgm.report import detection_table, predict_json
+    from qsgm.tuned import load_object
+
+    found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
+    frame = read_frame(scene)
+    detection, heatmap = found.locate(frame)
+    name = found.description.name
+    if output is not None:
+        write_png(output, draw_detection(frame, heatmap, detection, name))
+    report = predict_json(detection, heatmap.shape, name, output)
+    _show(report, detection_table(detection, name), as_json)
+    if output is not None and not as_json:
+        typer.echo(f"picture: {output}")
+
+
+@app.command()
+def fidelity(
+    frame: FrameArgument,
+    int8: PrecisionOption = None,
+    layers: Annotated[int, typer.Option(min=2, max=3, help="The last one has no SGM.")] = 3,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = 20,
+    seed: SeedOption = 0,
+    center: CenterOption = None,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
+    from qsgm.report import fidelity_command_json, fidelity_report
+
+    settings = _settings(int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads)
+    result = _finetune(frame, _bundle(bundle), settings)
+    report = fidelity_command_json(result, frame.stem)
+    _write_report(report, output)
+    _show(report, fidelity_report(result), as_json)
+
+
+@bench.command("accuracy")
+def bench_accuracy(
+    frames: FramesOption = None,
+    layers: LayersOption = 3,
+    epochs: EpochsOption = 20,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    per_frame: Annotated[bool, typer.Option("--per-frame", help="A line per frame, too.")] = False,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Untouched, SGM in int8 and float, backpropagation: on the same crops of every frame."""
+    from qsgm.bench.accuracy import measure_accuracy
+    from qsgm.bench.frames import list_frames
+    from qsgm.finetune import Settings
+
+    some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
+    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    with _progress() as watch:
+        report = measure_accuracy(some, _bundle(bundle), settings, watch)
+    _write_report(report.to_json(), output)
+    _show(report.to_json(), report.render(per_frame), as_json)
+
+
+@bench.command("scenes")
+def bench_scenes(
+    frames: FramesOption = None,
+    scenes: Annotated[int, typer.Option(min=1, max=1000, help="With the object, per frame.")] = 3,
+    int8: PrecisionOption = None,
+    method: MethodOption = MethodName.SGM,
+    layers: LayersOption = 3,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = 20,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write some pictures here.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Teach on every frame, find its object in scenes made from it, and not on the empty table."""
+    from qsgm.bench.frames import list_frames
+    from qsgm.bench.scenes import measure_scenes
+
+    some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
+    settings = _settings(int8, method, layers, optimizer, epochs, seed, None, threads)
+    with _progress() as watch:
+        report = measure_scenes(some, _bundle(bundle), settings, scenes, watch, output)
+    _show(report.to_json(), report.render(), as_json)
+
+
+@bench.command("speed")
+def bench_speed(
+    frames: FramesOption = None,
+    layers: LayersOption = 3,
+    epochs: EpochsOption = 20,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of every variant.")] = 5,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Seconds per stage on the first frame, next to the same job in torch if it is installed."""
+    from qsgm.bench.frames import list_frames
+    from qsgm.bench.speed import measure_speed, render
+    from qsgm.finetune import Settings
+
+    frame = list_frames(paths.calibration_folder() if frames is None else frames, 1)[0].path
+    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    with _progress() as watch:
+        report = measure_speed(frame, _bundle(bundle), settings, repeats, watch)
+    _write_report(report, output)
+    _show(report, render(report), as_json)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line; the exit code.
+
+    Exceptions that are nobody's fault but this program's are not caught.
+    """
+    try:
+        command = typer.main.get_command(app)
+        code = command.main(list(arguments) or ["--help"], prog_name="qsgm", standalone_mode=False)
+        code = code if isinstance(code, int) else 0
+    except QsgmError as error:
+        _complain(f"error: {error}")
+        return EXIT_BAD_INPUT
+    except USAGE_ERROR as error:
+        usage = cast(Any, error)
+        command_path = usage.ctx.command_path if usage.ctx else "qsgm"
+        message = usage.format_message().rstrip(". ")
+        _complain(f"{command_path}: {message}; see `{command_path} --help`")
+        return int(usage.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED:  # newer versions of typer turn the exception into the code
+        _complain("interrupted")
+    return code
+
+
+def main() -> None:
+    """Entry point of the installed command."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def _complain(message: str) -> None:
+    """One line on stderr, whatever a file's name may hold."""
+    typer.echo(" ".join(message.splitlines()), err=True)
+
+
+def _show(values: dict[str, Any], table: RenderableType, as_json: bool) -> None:
+    if as_json:
+        _print_json(values)
+    else:
+        Console().print(table)
+
+
+def _print_json(values: dict[str, Any]) -> None:
+    from qsgm.report import to_json
+
+    typer.echo(to_json(values))
+
+
+def _write_report(values: dict[str, Any], path: Path | None) -> None:
+    from qsgm.files import write_text_atomic
+    from qsgm.report import to_json
+
+    if path is not None:
+        write_text_atomic(path, to_json(values) + "\n")
+
+
+def _bundle(folder: Path | None) -> "Bundle":
+    from qsgm.bundle import load_bundle
+
+    return load_bundle(paths.bundle_folder(folder))
+
+
+def _settings(
+    int8: bool | None,
+    method: MethodName,
+    layers: int,
+    optimizer: OptimizerChoice | None,
+    epochs: int,
+    seed: int,
+    center: str | None,
+    threads: int,
+) -> "Settings":
+    from qsgm.finetune import Settings
+
+    if method is MethodName.BP and int8:
+        _complain("note: backpropagation runs in float; --int8 concerns SGMs only")
+    return Settings(
+        method=method.value,
+        precision="float" if int8 is False or method is MethodName.BP else "int8",
+        layers=layers,
+        optimizer=None if optimizer is None else optimizer.value,
+        epochs=epochs,
+        seed=seed,
+        center_px=_center(center),
+        threads=threads,
+    )
+
+
+def _center(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r} is not a point: expected x,y in px, such as 320,240",
+            param_hint="'--center'",
+        ) from error
+    return x, y
+
+
+def _finetune(frame: Path, bundle: "Bundle", settings: "Settings") -> "FinetuneResult":
+    from qsgm.finetune import finetune as run_finetune
+    from qsgm.images import read_demonstration
+
+    demonstration = read_demonstration(frame)
+    with _progress() as watch:
+        return run_finetune(demonstration, bundle, settings, watch)
+
+
+def _remember(folder: Path, *, chosen: bool) -> None:
+    """Make this the object that `predict` uses; with `-o` that is a convenience, not the point."""
+    try:
+        paths.remember_object(folder)
+    except QsgmError as error:
+        if not chosen:
+            raise
+        _complain(f"note: `qsgm predict` will need --object {folder}: {error}")
+
+
+def _host_module(name: str) -> Any:
+    """A module of the host side, or one line saying what it takes."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in HOST_LIBRARIES:
+            raise
+        raise QsgmError(
+            f"this command runs on the host and needs {missing}, which is not installed: "
+            f"install with pip install 'qsgm[train]'"
+        ) from error
+
+
+@contextmanager
+def _progress() -> Iterator[Watch]:
+    """A bar per stage on stderr, on a terminal only; yields what is told about progress."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:>10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[values]}"),
+    )
+    tasks: dict[str, TaskID] = {}
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+
+        def watch(stage: str, done: int, of: int, values: dict[str, float] | None = None) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=of, values="")
+            shown = "  ".join(f"{name} {value:.4g}" for name, value in (values or {}).items())
+            progress.update(tasks[stage], completed=done, total=of, values=shown)
+
+        yield watch
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,374 @@
+"""Ranges for the int8 SGMs, and how faithful the int8 SGMs are, along whole fine-tuning runs.
+
+Activations move while layers train, so ranges are taken from the first step to the last, on every
+calibration frame, channel by channel. Values are looked at and dropped: one frame is in memory at
+a time, and of each run only its current step.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Protocol, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from qsgm.errors import QsgmError
+from qsgm.fidelity import LayerFidelity, compare, mean_over_run
+from qsgm.images import read_frame
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.fold import FloatArray, FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.train.graspnet import LAYERS
+from qsgm.train.local import LayerState, local_step, loss_gradient, true_gradients
+from qsgm.train.maml import MOMENTUM
+from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward
+from qsgm.train.tasks import Task, make_task, start_states
+from qsgm.tuning import BATCH, rate_factor
+from qsgm.weights import to_step_layout
+
+MANIFEST = "manifest.json"
+CROPS = 400
+EPOCHS = 40  # as many steps as 20 epochs on the 800 crops of the device
+MOST_LAYERS = 3
+SGM_BEHIND_TUNED = tuple(range(LAYERS + 1 - MOST_LAYERS, LAYERS))
+# The label is known before anything is seen: quality, sine, cosine.
+LABEL_LOW = np.array([0, -1, -1], np.float32)
+LABEL_HIGH = np.array([1, 1, 1], np.float32)
+# Steps between two measurements of fidelity; consecutive steps tell the same.
+MEASURE_EVERY_STEPS = 13
+
+# (what is going on, frames done, of how many)
+Watch = Callable[[str, int, int], None]
+# (layer, what its SGM sees (B, Ci)) -> gradient (B, C)
+SgmGradient = Callable[[int, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """A frame (H, W, 3) BGR and the object's centre (x, y) in it [px]."""
+
+    image: NDArray[np.uint8]
+    center_px: tuple[float, float]
+
+
+class CalibrationSet:
+    """The frames that a folder's manifest lists; each is read when its turn comes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / MANIFEST
+        try:
+            self.manifest_bytes = path.read_bytes()
+            listed = json.loads(self.manifest_bytes)["frames"]
+            self._frames = [(f["file"], f["sha256"], tuple(f["center_px"])) for f in listed]
+        except OSError as error:
+            raise QsgmError(
+                f"{folder} is no calibration set, it has no {MANIFEST};"
+                f" make one with `qsgm draw-calibration -o {folder}`"
+            ) from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise QsgmError(
+                f'{path} is damaged: expected {{"frames": [{{"file", "sha256", "center_px"}}]}};'
+                " make it again with `qsgm draw-calibration`"
+            ) from error
+        if not self._frames:
+            raise QsgmError(f"{path} lists no frames: there is nothing to calibrate on")
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, i: int) -> Demonstration:
+        name, sha256, center_px = self._frames[i]
+        image = read_frame(self.folder / name)
+        if hashlib.sha256((self.folder / name).read_bytes()).hexdigest() != sha256:
+            raise QsgmError(
+                f"{self.folder / name} is not the frame the manifest describes (its sha256"
+                " differs); restore it or make the set again with `qsgm draw-calibration`"
+            )
+        return Demonstration(image, center_px)
+
+
+class Observer(Protocol):
+    """Watches the channels of one tensor and says what span of values int8 has to cover."""
+
+    def update(self, values: FloatArray) -> None:
+        """Look at values (N, C) before they are dropped."""
+        ...
+
+    def merge(self, other: Self) -> None:
+        """Take in what another observer of the same tensor has seen."""
+        ...
+
+    def span(self) -> tuple[FloatArray, FloatArray]:
+        """Low and high end of each channel, (C,) each."""
+        ...
+
+
+class MinMax:
+    """Everything that was seen."""
+
+    name = "minmax"
+
+    def __init__(self, channels: int) -> None:
+        self._low = np.full(channels, np.inf, np.float32)
+        self._high = np.full(channels, -np.inf, np.float32)
+
+    def update(self, values: FloatArray) -> None:
+        self._include(values.min(axis=0), values.max(axis=0))
+
+    def merge(self, other: Self) -> None:
+        self._include(*other.span())
+
+    def span(self) -> tuple[FloatArray, FloatArray]:
+        return self._low, self._high
+
+    def _include(self, low: FloatArray, high: FloatArray) -> None:
+        # Not in place: what `span` gave away stays as it was.
+        self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+
+
+class SgmObservers:
+    """Observers of everything in one SGM that gets a range: its activation, its hidden tensors."""
+
+    def __init__(self, sgm: FoldedSgm, make: Callable[[int], Observer] = MinMax) -> None:
+        self._activation = make(len(sgm.convs[-1].bias))
+        self._hidden = [make(len(conv.bias)) for conv in sgm.convs[:-1]]
+
+    def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
+        """One batch: inputs (B, Ci) and hidden tensors (B, H), after ReLU."""
+        self._activation.update(seen[:, : -len(LABEL_LOW)])
+        for observer, values in zip(self._hidden, hidden, strict=True):
+            observer.update(values)
+
+    def merge(self, other: "SgmObservers") -> None:
+        """Take in what was seen on another frame."""
+        self._activation.merge(other._activation)
+        for observer, others in zip(self._hidden, other._hidden, strict=True):
+            observer.merge(others)
+
+    def ranges(self) -> SgmRanges:
+        """What the SGM's int8 version has to cover."""
+        low, high = self._activation.span()
+        return SgmRanges(
+            np.concatenate([low, LABEL_LOW]),
+            np.concatenate([high, LABEL_HIGH]),
+            tuple(observer.span()[1] for observer in self._hidden),
+        )
+
+
+@dataclass(frozen=True)
+class Trainee:
+    """What is fine-tuned: a checkpoint, and what the device gets of it."""
+
+    checkpoint: Checkpoint
+    net: FoldedNet
+    sgms: Mapping[int, FoldedSgm]  # by layer
+
+    def start(self, tuned: int) -> list[LayerState]:
+        """The last `tuned` layers before the first step."""
+        layers = self.net.layers[LAYERS - tuned :]
+        return start_states(
+            [
+                (torch.from_numpy(to_step_layout(layer.weight)).T, torch.from_numpy(layer.bias))
+                for layer in layers
+            ],
+            tasks=1,
+        )
+
+    def task(self, demonstration: Demonstration, tuned: int, seed: list[int]) -> Task:
+        """The crops of one frame, as the first of the tuned layers sees them."""
+        return make_task(
+            self.checkpoint.net,
+            demonstration.image,
+            np.random.default_rng(seed),
+            last_frozen=LAYERS - tuned,
+            count=CROPS,
+            loss=self.checkpoint.loss,
+            center_px=demonstration.center_px,
+        )
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One step of a run: the tuned layers before it, and the batch that they are about to see."""
+
+    states: list[LayerState]
+    features: Tensor  # (1, B, P, C)
+    labels: Tensor  # (1, B, 3)
+
+
+def prepare(checkpoint: Checkpoint) -> Trainee:
+    """Fold a checkpoint.
+
+    Raises:
+        QsgmError: batchnorm cannot be folded, or SGMs or rates for up to three layers are missing.
+    """
+    expected = {tuned: tuned for tuned in range(1, MOST_LAYERS + 1)}
+    got = {tuned: len(rates) for tuned, rates in checkpoint.rates.items()}
+    if set(checkpoint.sgms) != set(SGM_BEHIND_TUNED) or got != expected:
+        raise QsgmError(
+            f"the checkpoint has SGMs behind layers {sorted(checkpoint.sgms)} and rates (count by"
+            f" tuned layers) {got}, expected {[*SGM_BEHIND_TUNED]} and {expected}; pretrain again"
+        )
+    sgms = {layer: fold_sgm(sgm) for layer, sgm in sorted(checkpoint.sgms.items())}
+    return Trainee(checkpoint, fold_net(checkpoint.net), sgms)
+
+
+def calibrate(
+    trainee: Trainee, frames: CalibrationSet, seed: int, watch: Watch, epochs: int = EPOCHS
+) -> dict[int, SgmRanges]:
+    """Fine-tune on every frame with the float SGMs and take each SGM's ranges on the way.
+
+    Layers are tuned by twos and by threes: the SGM behind layer 5 serves both.
+
+    Args:
+        trainee: what to fine-tune.
+        frames: the calibration set.
+        seed: of crops and batches.
+        watch: told about progress.
+        epochs: length of a run.
+
+    Returns:
+        Ranges by layer.
+
+    Raises:
+        QsgmError: a run diverged, or a frame cannot be used.
+    """
+    total = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
+    for i in range(len(frames)):
+        watch("calibrate", i, len(frames))
+        for layer, observers in observe_frame(trainee, frames[i], [seed, i], epochs).items():
+            total[layer].merge(observers)
+    watch("calibrate", len(frames), len(frames))
+    return {layer: observers.ranges() for layer, observers in total.items()}
+
+
+def observe_frame(
+    trainee: Trainee, demonstration: Demonstration, seed: list[int], epochs: int
+) -> dict[int, SgmObservers]:
+    """What each SGM sees in the runs on one frame."""
+    observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
+
+    def gradient(layer: int, seen: FloatArray) -> FloatArray:
+        result, hidden = float_trace(trainee.sgms[layer], seen)
+        observers[layer].update(seen, hidden)
+        return result
+
+    for tuned in range(2, MOST_LAYERS + 1):
+        for _ in run(trainee, demonstration, tuned, seed, epochs, gradient):
+            pass
+    return observers
+
+
+def measure(
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int = EPOCHS,
+) -> dict[int, LayerFidelity]:
+    """Fidelity of each int8 SGM, mean over runs of the last three layers on every frame.
+
+    The int8 SGMs drive the runs, as on the device: what they see is what they have led to.
+    """
+    measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
+    for i in range(len(frames)):
+        watch("measure", i, len(frames))
+        moments = run(
+            trainee,
+            frames[i],
+            MOST_LAYERS,
+            [seed, i],
+            epochs,
+            lambda layer, seen: integer_forward(int8_sgms[layer], seen)[0],
+        )
+        for moment in islice(moments, 0, None, MEASURE_EVERY_STEPS):
+            for layer, fidelity in compare_moment(trainee, int8_sgms, moment).items():
+                measured[layer].append(fidelity)
+    watch("measure", len(frames), len(frames))
+    return {layer: mean_over_run(values) for layer, values in measured.items()}
+
+
+def compare_moment(
+    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], moment: Moment
+) -> dict[int, LayerFidelity]:
+    """Int8, float and true gradients on one batch, of all layers as they are at that moment."""
+    true = true_gradients(moment.states, moment.features, moment.labels, trainee.checkpoint.loss)
+    fidelity = {}
+
+    def gradient(layer: int, seen: FloatArray) -> FloatArray:
+        int8, clipped = integer_forward(int8_sgms[layer], seen)
+        floating, _ = float_trace(trainee.sgms[layer], seen)
+        fidelity[layer] = compare(int8, floating, true[layer][0, :, 0].numpy(), clipped)
+        return int8
+
+    still = [torch.zeros(())] * len(moment.states)
+    step(trainee, moment, still, gradient)
+    return fidelity
+
+
+def run(
+    trainee: Trainee,
+    demonstration: Demonstration,
+    tuned: int,
+    seed: list[int],
+    epochs: int,
+    sgm_gradient: SgmGradient,
+) -> Iterator[Moment]:
+    """Fine-tune the last `tuned` layers on one frame as the device does; yields before every step.
+
+    Raises QsgmError when the run diverges.
+    """
+    task = trainee.task(demonstration, tuned, seed)
+    states = trainee.start(tuned)
+    rates = torch.tensor(trainee.checkpoint.rates[tuned])
+    done, steps = 0, epochs * -(-len(task.labels) // BATCH)
+    generator = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**31)))
+    for _ in range(epochs):
+        for rows in torch.randperm(len(task.labels), generator=generator).split(BATCH):
+            moment = Moment(states, task.features[None, rows], task.labels[None, rows])
+            yield moment
+            factor = rate_factor(done, steps)
+            states = step(trainee, moment, list(factor * rates), sgm_gradient)
+            refuse_unless_finite(states)
+            done += 1
+
+
+def refuse_unless_finite(states: list[LayerState]) -> None:
+    """Raise QsgmError for a run that has blown up."""
+    if not all(torch.isfinite(state.weight).all() for state in states):
+        raise QsgmError(
+            f"fine-tuning {len(states)} layers on a calibration frame diverged: the checkpoint's"
+            " SGMs and rates do not work; pretrain again"
+        )
+
+
+def step(
+    trainee: Trainee, moment: Moment, rates: list[Tensor], sgm_gradient: SgmGradient
+) -> list[LayerState]:
+    """One feed-forward step."""
+    loss = trainee.checkpoint.loss
+
+    def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
+        if layer == LAYERS:
+            return loss_gradient(loss, activation, labels[:, :, None])
+        seen = torch.cat([activation[0, :, 0], labels[0]], dim=1).numpy()
+        return torch.from_numpy(sgm_gradient(layer, seen))[None, :, None]
+
+    return local_step(moment.states, moment.features, moment.labels, rates, gradient_of, MOMENTUM)
+
+
+def float_trace(sgm: FoldedSgm, seen: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """A 1x1 SGM in float: inputs (B, Ci) to gradient (B, C) and hidden tensors (B, H)."""
+    x, hidden = seen, []
+    for conv in sgm.convs[:-1]:
+        x = np.maximum(x @ conv.weight[:, :, 0, 0].T + conv.bias, 0)
+        hidden.append(x)
+    last = sgm.convs[-1]
+    return x @ last.weight[:, :, 0, 0].T + last.bias, hidden

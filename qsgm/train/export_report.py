@@ -1,0 +1,182 @@
+"""What exporting found out: as JSON, as a table, and as the bundle's model card."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from qsgm.fidelity import LayerFidelity
+from qsgm.report import fidelity_json, plain_table
+from qsgm.train.calibrate import LABEL_LOW, MinMax
+from qsgm.train.fold import FoldedSgm
+from qsgm.train.quantize import QuantizedSgm, SgmRanges
+
+_HEADERS = ("layer", "range", "scale", "cos int8,float", "norm int8/true", "SQNR dB", "bytes")
+
+
+@dataclass(frozen=True)
+class LayerReport:
+    """One SGM: how faithful its int8 version is, mean over the calibration runs, and its size."""
+
+    fidelity: LayerFidelity
+    ranges: SgmRanges
+    sgm: FoldedSgm
+    int8_sgm: QuantizedSgm
+
+    @property
+    def float_bytes(self) -> int:
+        """Of its constants."""
+        return sum(conv.weight.nbytes + conv.bias.nbytes for conv in self.sgm.convs)
+
+    @property
+    def int8_bytes(self) -> int:
+        """Of its constants, scales included."""
+        arrays: list[NDArray[Any]] = [self.int8_sgm.input_low, self.int8_sgm.input_gain]
+        for product in self.int8_sgm.products:
+            arrays += [product.weight, product.scale, product.bias]
+        return sum(array.nbytes for array in arrays)
+
+    @property
+    def activation_range(self) -> tuple[float, float]:
+        """Lowest and highest activation of any channel."""
+        low, high = (
+            ends[: -len(LABEL_LOW)] for ends in (self.ranges.input_low, self.ranges.input_high)
+        )
+        return float(low.min()), float(high.max())
+
+    @property
+    def activation_scale(self) -> tuple[float, float]:
+        """What one u8 step stands for in the finest and in the coarsest activation channel."""
+        step = 1 / self.int8_sgm.input_gain[: -len(LABEL_LOW)]
+        return float(step.min()), float(step.max())
+
+    def to_json(self) -> dict[str, Any]:
+        """The fidelity keys, then ranges, scales, silent channels and bytes."""
+        return {
+            **fidelity_json(self.fidelity),
+            "range": {
+                "activation": _short(*self.activation_range),
+                "hidden": _short(*(float(high.max()) for high in self.ranges.hidden_high)),
+            },
+            "scale": _short(*self.activation_scale),
+            "dead_channels": {
+                "input": list(self.int8_sgm.dead_inputs),
+                "hidden": [list(dead) for dead in self.int8_sgm.dead_hidden],
+            },
+            "bytes": {"float": self.float_bytes, "int8": self.int8_bytes},
+        }
+
+    def cells(self) -> tuple[str, ...]:
+        """What a table shows of it."""
+        low, high = self.activation_range
+        fine, coarse = self.activation_scale
+        return (
+            str(self.sgm.layer),
+            f"{low:.2g} to {high:.3g}",
+            f"{fine:.2g} to {coarse:.2g}",
+            f"{self.fidelity.cos_int8_float:.5f}",
+            f"{self.fidelity.norm_ratio_int8_true:.2f}",
+            f"{self.fidelity.sqnr_db:.1f}",
+            f"{self.int8_bytes} of {self.float_bytes}",
+        )
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What :func:`qsgm.train.export.fold_and_quantize` did."""
+
+    output: str
+    layers: dict[int, LayerReport]
+    fold_max_abs_error: float
+    bundle_bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The stable keys of `qsgm fold-and-quantize`, then the others."""
+        layers = self.layers.values()
+        return {
+            "output": self.output,
+            "calibrator": {str(k): MinMax.name for k in self.layers},
+            "layers": {str(k): layer.to_json() for k, layer in self.layers.items()},
+            "fold_max_abs_error": _short(self.fold_max_abs_error)[0],
+            "bytes": {
+                "float": sum(layer.float_bytes for layer in layers),
+                "int8": sum(layer.int8_bytes for layer in layers),
+            },
+            "bundle_bytes": self.bundle_bytes,
+        }
+
+    def __rich__(self) -> Table:
+        return table(self)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a bundle was made from."""
+
+    checkpoint_name: str
+    checkpoint_sha256: str
+    card: dict[str, Any]  # of the checkpoint
+    frames: int
+    calibration_sha256: str  # of the calibration set's manifest
+
+
+def table(report: ExportReport) -> Table:
+    """One row per SGM layer."""
+    result = plain_table(f"{report.output}: int8 SGMs, mean over the calibration runs")
+    for header in _HEADERS:
+        result.add_column(header, justify="right")
+    for layer in report.layers.values():
+        result.add_row(*layer.cells())
+    return result
+
+
+def model_card(report: ExportReport, provenance: Provenance) -> str:
+    """The bundle's README.md."""
+    rows = [_HEADERS, ("--:",) * len(_HEADERS), *(one.cells() for one in report.layers.values())]
+    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    card = json.dumps(provenance.card, indent=1, sort_keys=True)
+    return f"""# GraspNet with int8 synthetic gradient modules
+
+Standard ONNX graphs for fine-tuning GraspNet on the device, feed-forward; `manifest.json` says what
+is in them. Batchnorm and pixel normalisation are folded into the convolutions (largest change of
+any output: {report.fold_max_abs_error:.1e}).
+
+| file | what |
+| --- | --- |
+| `network.onnx` | a frame to its heatmap |
+| `trunk_N.onnx` | crops to features, when the last N layers are tuned |
+| `head_N.onnx` | features to outputs |
+| `step_sgm_int8_*_N.onnx`, `step_sgm_float_*_N.onnx` | a training step with SGMs, SGD or Adam |
+| `step_bp_*_N.onnx` | the same step by backpropagation, for comparison |
+| `probe_N.onnx` | int8, float and true gradients of a batch |
+
+## Made from
+
+    qsgm fold-and-quantize {provenance.checkpoint_name}
+
+- checkpoint: sha256 `{provenance.checkpoint_sha256}`
+- calibration set: {provenance.frames} frames, sha256 of its manifest
+  `{provenance.calibration_sha256}`
+
+How the checkpoint was pretrained, and what it scored:
+
+```json
+{card}
+```
+
+## The int8 SGMs
+
+u8 activations, s8 weights, a scale for every channel (calibrator: {MinMax.name}), float gradients
+out. Measured while the int8 SGMs fine-tuned the last three layers on the calibration frames;
+range and scale are those of the activation channels.
+
+{lines}
+"""
+
+
+def _short(*values: float) -> list[float]:
+    """Six significant digits."""
+    return [float(f"{np.float64(value):.6g}") for value in values]

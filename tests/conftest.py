@@ -1,0 +1,195 @@
+"""What several tests share: a bundle with random weights, and frames with something on them."""
+
+import hashlib
+import json
+import shutil
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from qsgm import bundle as bundles
+from qsgm.bundle import Bundle, load_bundle
+from qsgm.crops import cut_crops, plan_crops
+from qsgm.images import write_png
+from qsgm.train.fold import FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
+from qsgm.train.graphs.probe import head_model, probe_model
+from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
+from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
+from qsgm.train.graspnet import CHANNELS, GraspNet, Loss, normalize
+from qsgm.train.quantize import QuantizedSgm, SgmRanges, quantize_sgm
+from qsgm.train.sgm import Sgm
+
+# Threads that wait for each other on a busy machine take longer than this work does.
+torch.set_num_threads(1)
+
+MOST_LAYERS = 3
+RATES = (0.002, 0.005, 0.02)
+OPTIMIZERS: dict[bundles.OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
+
+
+@pytest.fixture(scope="session")
+def bundle_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole bundle; nothing in it was trained. Not to be changed: copy it."""
+    folder = tmp_path_factory.mktemp("bundle") / "export"
+    folder.mkdir()
+    write_bundle(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def bundle(bundle_folder: Path) -> Bundle:
+    return load_bundle(bundle_folder)
+
+
+@pytest.fixture
+def own_bundle(bundle_folder: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(bundle_folder, tmp_path / "own_bundle"))
+
+
+@pytest.fixture(scope="session")
+def drawn() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A frame with a red bar in its middle, and where the bar is."""
+    frame, mask = draw_frame()
+    return frame, mask > 0
+
+
+@pytest.fixture(scope="session")
+def frame(drawn: tuple[NDArray[np.uint8], NDArray[np.bool_]]) -> NDArray[np.uint8]:
+    return drawn[0]
+
+
+@pytest.fixture(scope="session")
+def frames_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames with masks and a manifest: one elongated object, one round."""
+    folder = tmp_path_factory.mktemp("frames")
+    for name, length in (("bar", 90), ("disk", 0)):
+        picture, mask = draw_frame(length)
+        write_png(folder / f"{name}.png", picture)
+        write_png(folder / f"{name}_mask.png", mask)
+    entries = [
+        {"file": "bar.png", "mask": "bar_mask.png", "elongated": True},
+        {"file": "disk.png", "mask": "disk_mask.png", "elongated": False},
+    ]
+    (folder / "manifest.json").write_text(json.dumps(entries))
+    return folder
+
+
+@pytest.fixture
+def frame_path(frames_folder: Path) -> Path:
+    return frames_folder / "bar.png"
+
+
+@pytest.fixture(autouse=True)
+def _own_data_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a test tunes stays out of the user's objects."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+
+def draw_frame(length: int = 90) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A bar (or, of length 0, a disk) on a noisy table, and its mask."""
+    rng = np.random.default_rng(0)
+    table = np.array([120, 140, 160]) + cv2.GaussianBlur(
+        rng.normal(0, 60, (480, 640, 3)), (0, 0), 3
+    )
+    mask = np.zeros((480, 640), np.uint8)
+    along = np.array([np.cos(0.4), -np.sin(0.4)]) * length / 2
+    ends = [tuple(int(v) for v in np.rint(np.array([320, 240]) + s * along)) for s in (-1, 1)]
+    cv2.line(mask, ends[0], ends[1], 255, 26, cv2.LINE_AA)
+    table[mask > 127] = (40, 60, 200)
+    return np.clip(table, 0, 255).astype(np.uint8), np.where(mask > 127, 255, 0).astype(np.uint8)
+
+
+def write_bundle(folder: Path) -> None:
+    """Every graph a bundle holds, and the manifest."""
+    torch.manual_seed(0)
+    net, loss = fold_net(_random_net()), Loss()
+    float_sgms = {layer: _random_sgm(layer) for layer in (4, 5)}
+    int8_sgms = {layer: _quantized(sgm) for layer, sgm in float_sgms.items()}
+    models = {bundles.NETWORK: network_model(net, loss.encoding)}
+    for tuned in range(1, MOST_LAYERS + 1):
+        models[bundles.trunk_file(tuned)] = trunk_model(net, 6 - tuned)
+        models[bundles.head_file(tuned)] = head_model(net, tuned, loss.encoding)
+        if tuned > 1:
+            probe = probe_model(net, tuned, float_sgms, int8_sgms, loss)
+            models[bundles.probe_file(tuned)] = probe
+        for name, optimizer in OPTIMIZERS.items():
+            step = backprop_step_model(net, tuned, loss, optimizer)
+            models[bundles.step_file("bp", "float", name, tuned)] = step
+    precisions: list[tuple[bundles.Precision, dict[int, AnySgm]]] = [
+        ("float", dict(float_sgms)),
+        ("int8", dict(int8_sgms)),
+    ]
+    for (precision, sgms), name, tuned in product(precisions, OPTIMIZERS, (2, 3)):
+        step = step_model(net, tuned, sgms, loss, OPTIMIZERS[name])
+        models[bundles.step_file("sgm", precision, name, tuned)] = step
+    for file, model in models.items():
+        (folder / file).write_bytes(model.SerializeToString())
+    (folder / bundles.MANIFEST).write_text(json.dumps(_manifest(folder, net, loss)))
+
+
+def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
+    offsets = initializer_offsets((folder / bundles.NETWORK).read_bytes())
+    arrays = {f"weight{k}": layer.weight for k, layer in enumerate(net.layers, 1)}
+    arrays |= {f"bias{k}": layer.bias for k, layer in enumerate(net.layers, 1)}
+    rates = {
+        "sgd": {str(n): RATES[-n:] for n in (1, 2, 3)},
+        "adam": {str(n): [1e-3] * n for n in (1, 2, 3)},
+    }
+    return {
+        "format": bundles.FORMAT,
+        "version": bundles.VERSION,
+        "encoding": loss.encoding,
+        "label_smoothing": loss.label_smoothing,
+        "most_layers": MOST_LAYERS,
+        "recipes": {
+            "sgm": {"optimizer": "sgd", "rates": rates},
+            "bp": {"optimizer": "adam", "rates": rates},
+        },
+        "initializers": {
+            name: {"shape": list(array.shape), "offset": offsets[name][0]}
+            for name, array in arrays.items()
+        },
+        "files": {
+            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+            for path in sorted(folder.glob("*.onnx"))
+        },
+    }
+
+
+def _random_net() -> GraspNet:
+    """Random weights; batchnorm has seen crops, so that every layer's outputs vary."""
+    net = GraspNet()
+    frame = draw_frame()[0]
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 64)
+    with torch.no_grad():
+        for _ in range(20):
+            net(normalize(torch.from_numpy(cut_crops(frame, plan))))
+    return net.eval()
+
+
+def _random_sgm(layer: int) -> FoldedSgm:
+    """Gradients of about the size of true ones: untrained SGMs would run away."""
+    sgm = Sgm(layer, (12,))
+    last = sgm.convs[-1]
+    assert isinstance(last, nn.Conv2d)
+    nn.init.normal_(last.weight, std=0.01)
+    nn.init.zeros_(last.bias)
+    return fold_sgm(sgm.eval())
+
+
+def _quantized(sgm: FoldedSgm) -> QuantizedSgm:
+    """Ranges of activations up to 10, any label, and what the hidden layer makes of those."""
+    low = np.array([0.0] * CHANNELS[sgm.layer] + [0, -1, -1], np.float32)
+    high = np.array([10.0] * CHANNELS[sgm.layer] + [1, 1, 1], np.float32)
+    inputs = np.random.default_rng(0).uniform(low, high, (500, len(low)))
+    first = sgm.convs[0]
+    hidden = np.maximum(inputs @ first.weight[:, :, 0, 0].T + first.bias, 0).max(axis=0)
+    return quantize_sgm(sgm, SgmRanges(low, high, (hidden.astype(np.float32) + 1,)))

@@ -1,0 +1,111 @@
+"""A bundle is used as it was exported, or refused in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+
+from qsgm import QsgmError, load_bundle
+from qsgm.bundle import NETWORK, Bundle, step_file, trunk_file, tuned_layers
+
+
+def test_a_whole_bundle_loads(bundle: Bundle) -> None:
+    assert bundle.encoding == "double"
+    assert 0 <= bundle.label_smoothing < 1
+    assert bundle.most_layers == 3
+
+
+def test_names_of_layers_and_steps() -> None:
+    assert list(tuned_layers(2)) == [5, 6]
+    assert step_file("sgm", "int8", "sgd", 3) == "step_sgm_int8_sgd_3.onnx"
+    assert step_file("bp", "float", "adam", 2) == "step_bp_adam_2.onnx"
+    # The last layer has its gradient from the loss: one layer needs no SGM.
+    assert step_file("sgm", "int8", "sgd", 1) == step_file("bp", "float", "sgd", 1)
+
+
+def test_sgms_stand_behind_all_tuned_layers_but_the_last(bundle: Bundle) -> None:
+    assert bundle.sgm_layers(3) == (4, 5)
+    assert bundle.sgm_layers(1) == ()
+
+
+def test_a_recipe_has_a_rate_per_layer_and_its_own_optimizer(bundle: Bundle) -> None:
+    assert bundle.recipe("sgm", 3, None).optimizer == "sgd"
+    assert bundle.recipe("bp", 3, None).optimizer == "adam"
+    assert bundle.recipe("bp", 2, "sgd").optimizer == "sgd"
+    for tuned in (1, 2, 3):
+        assert len(bundle.recipe("sgm", tuned, None).rates) == tuned
+
+
+def test_start_weights_are_those_in_the_network(bundle: Bundle) -> None:
+    model = onnx.load(bundle.folder / NETWORK)
+    inside = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    start = bundle.start_weights(3)
+    assert set(start) == {"weight4", "bias4", "weight5", "bias5", "weight6", "bias6"}
+    for name, value in start.items():
+        np.testing.assert_array_equal(value, inside[name])
+
+
+def test_exchanged_weights_arrive_in_the_network_and_nothing_else_changes(bundle: Bundle) -> None:
+    start = bundle.start_weights(3)
+    new = {name: np.asarray(value + 1, dtype=np.float32) for name, value in start.items()}
+    model = onnx.load_from_string(bundle.network_with(new))
+    inside = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    for name, value in new.items():
+        np.testing.assert_array_equal(inside[name], value)
+    assert bundle.network_with(start) == (bundle.folder / NETWORK).read_bytes()
+    with pytest.raises(ValueError, match="`bias6` must be"):
+        bundle.network_with({"bias6": np.zeros(4, np.float32)})
+
+
+def refusal(folder: Path) -> str:
+    with pytest.raises(QsgmError) as raised:
+        load_bundle(folder)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def test_a_missing_graph_is_named(own_bundle: Path) -> None:
+    (own_bundle / trunk_file(2)).unlink()
+    assert "lacks trunk_2.onnx; export it again" in refusal(own_bundle)
+
+
+def test_a_graph_altered_by_one_bit_is_named(own_bundle: Path) -> None:
+    path = own_bundle / NETWORK
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert f"{path} is not the file the manifest describes" in refusal(own_bundle)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("", "is not JSON"),
+        ("{", "is not JSON"),
+        ("[]", "is of format None"),
+        ('{"format": "qsgm-object", "version": 1}', "is of format ('qsgm-object', 1)"),
+        ('{"format": "qsgm-bundle", "version": 99}', "is of format ('qsgm-bundle', 99)"),
+    ],
+)
+def test_a_manifest_of_something_else_is_refused(
+    own_bundle: Path, content: str, expected: str
+) -> None:
+    (own_bundle / "manifest.json").write_text(content)
+    assert expected in refusal(own_bundle)
+
+
+def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
+    assert "holds no manifest.json" in refusal(tmp_path)
+
+
+def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    (own_bundle / trunk_file(3)).write_bytes(b"not a graph")
+    del manifest["files"][trunk_file(3)]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(QsgmError, match=r"cannot load .*trunk_3\.onnx"):
+        load_bundle(own_bundle).session(trunk_file(3))

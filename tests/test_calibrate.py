@@ -1,0 +1,243 @@
+"""Ranges along whole runs: what the observers see is what the SGMs saw, frame after frame."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from qsgm import QsgmError
+from qsgm.files import check_replaceable
+from qsgm.images import read_frame
+from qsgm.train import calibrate as module
+from qsgm.train.calibrate import (
+    CalibrationSet,
+    MinMax,
+    SgmObservers,
+    Trainee,
+    calibrate,
+    float_trace,
+    measure,
+    observe_frame,
+    prepare,
+    run,
+)
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.draw_calibration import draw_calibration_set
+from qsgm.train.draw_demo import draw_demo
+from qsgm.train.fold import FloatArray, run_folded_sgm
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.objects import TABLE_KINDS
+from qsgm.train.quantize import quantize_sgm
+from qsgm.train.sgm import Sgm
+
+RATES = {1: (1e-3,), 2: (1e-3, 1e-3), 3: (1e-3, 1e-3, 1e-3)}
+EPOCHS = 1
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Threads that wait for each other on a busy machine take longer than this work does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CROPS", 70)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("set") / "calib"
+    draw_calibration_set(folder, count=2, seed=3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trainee() -> Trainee:
+    torch.manual_seed(0)
+    sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
+    return prepare(Checkpoint(GraspNet().eval(), sgms, Loss(), RATES, {}))
+
+
+def ignore(_stage: str, _done: int, _of: int) -> None:
+    pass
+
+
+def test_min_max_sees_everything_in_any_order_and_grouping() -> None:
+    values = np.random.default_rng(0).normal(size=(60, 5)).astype(np.float32)
+    whole, first, second = MinMax(5), MinMax(5), MinMax(5)
+    whole.update(values)
+    for batch in np.split(values[:40], 4):
+        first.update(batch)
+    second.update(values[40:])
+    kept = second.span()[0].copy()
+    second.merge(first)
+    for got, expected in zip(second.span(), whole.span(), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    np.testing.assert_array_equal(whole.span(), [values.min(axis=0), values.max(axis=0)])
+    assert (second.span()[0] <= kept).all()
+
+
+def test_the_float_trace_is_the_folded_sgm(trainee: Trainee) -> None:
+    seen = np.random.default_rng(1).normal(size=(9, 19)).astype(np.float32)
+    gradient, hidden = float_trace(trainee.sgms[4], seen)
+    activation, labels = torch.tensor(seen[:, :16, None, None]), torch.tensor(seen[:, 16:])
+    expected = run_folded_sgm(trainee.sgms[4], activation, labels)
+    np.testing.assert_allclose(gradient, expected.flatten(1), rtol=1e-5, atol=1e-6)
+    assert [tensor.shape for tensor in hidden] == [(9, 8), (9, 6)]
+    assert min(tensor.min() for tensor in hidden) == 0
+
+
+def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trainee) -> None:
+    frames = CalibrationSet(folder)
+    seen: dict[int, list[FloatArray]] = {4: [], 5: []}
+
+    def gradient(layer: int, inputs: FloatArray) -> FloatArray:
+        seen[layer].append(inputs)
+        return float_trace(trainee.sgms[layer], inputs)[0]
+
+    for i in range(2):
+        for tuned in (2, 3):
+            steps = list(run(trainee, frames[i], tuned, [0, i], EPOCHS, gradient))
+            assert [len(moment.labels[0]) for moment in steps] == [32, 32, 6]
+    stages: list[tuple[str, int, int]] = []
+    ranges = calibrate(trainee, frames, 0, lambda *stage: stages.append(stage), EPOCHS)
+    assert stages == [("calibrate", done, 2) for done in (0, 1, 2)]
+    assert [len(batches) for batches in seen.values()] == [6, 12]
+    for layer, batches in seen.items():
+        inputs = np.concatenate(batches)
+        np.testing.assert_array_equal(ranges[layer].input_low[:16], inputs[:, :16].min(axis=0))
+        np.testing.assert_array_equal(ranges[layer].input_high[:16], inputs[:, :16].max(axis=0))
+        np.testing.assert_array_equal(ranges[layer].input_low[16:], [0, -1, -1])
+        np.testing.assert_array_equal(ranges[layer].input_high[16:], [1, 1, 1])
+        _, hidden = float_trace(trainee.sgms[layer], inputs)
+        for high, tensor in zip(ranges[layer].hidden_high, hidden, strict=True):
+            np.testing.assert_allclose(high, tensor.max(axis=0), rtol=1e-5)
+
+
+def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
+    def gradient(layer: int, seen: FloatArray) -> FloatArray:
+        return float_trace(trainee.sgms[layer], seen)[0]
+
+    first, *_, last = run(trainee, CalibrationSet(folder)[0], 3, [0], EPOCHS, gradient)
+    for before, after in zip(first.states, last.states, strict=True):
+        assert not torch.equal(before.weight, after.weight)
+
+
+def test_a_frame_alone_gives_part_of_the_ranges(folder: Path, trainee: Trainee) -> None:
+    frames = CalibrationSet(folder)
+    both = calibrate(trainee, frames, 0, ignore, EPOCHS)
+    alone = observe_frame(trainee, frames[1], [0, 1], EPOCHS)
+    for layer, observers in alone.items():
+        assert isinstance(observers, SgmObservers)
+        ranges = observers.ranges()
+        assert (ranges.input_low >= both[layer].input_low).all()
+        assert (ranges.input_high <= both[layer].input_high).all()
+
+
+def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee: Trainee) -> None:
+    frames = CalibrationSet(folder)
+    ranges = calibrate(trainee, frames, 0, ignore, EPOCHS)
+    int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in trainee.sgms.items()}
+    fidelity = measure(trainee, int8, frames, 0, ignore, EPOCHS)
+    assert set(fidelity) == {4, 5}
+    for layer in fidelity.values():
+        assert layer.cos_int8_float > 0.999
+        assert layer.sqnr_db > 25
+        assert layer.clipped_fraction < 1e-3
+        # Untrained as it is, the SGM's gradient has nothing to do with the true one.
+        assert layer.cos_int8_true == pytest.approx(layer.cos_float_true, abs=0.05)
+
+
+def test_a_run_that_diverges_is_refused(folder: Path, trainee: Trainee) -> None:
+    def gradient(_layer: int, seen: FloatArray) -> FloatArray:
+        return np.full((len(seen), 16), np.inf, np.float32)
+
+    with pytest.raises(QsgmError, match="fine-tuning 3 layers on a calibration frame diverged"):
+        list(run(trainee, CalibrationSet(folder)[0], 3, [0], EPOCHS, gradient))
+
+
+@pytest.mark.parametrize(
+    ("layers", "rates"), [((4,), RATES), ((4, 5, 3), RATES), ((4, 5), {1: (1e-3,), 3: (1e-3,)})]
+)
+def test_a_checkpoint_for_other_layers_is_refused(
+    layers: tuple[int, ...], rates: dict[int, tuple[float, ...]]
+) -> None:
+    sgms = {layer: Sgm(layer) for layer in layers}
+    with pytest.raises(QsgmError, match=r"expected \[4, 5\] and \{1: 1, 2: 2, 3: 3\}"):
+        prepare(Checkpoint(GraspNet(), sgms, Loss(), rates, {}))
+
+
+def test_a_drawn_set_is_the_same_twice_and_replaces_itself(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    draw_calibration_set(again, count=1, seed=4)
+    draw_calibration_set(again, count=2, seed=3)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == sorted(path.name for path in again.iterdir())
+    for name in names:
+        assert (folder / name).read_bytes() == (again / name).read_bytes()
+
+
+def test_the_shipped_set_shows_every_table_and_is_what_its_manifest_says() -> None:
+    shipped = Path(__file__).parent.parent / "calib"
+    manifest = json.loads((shipped / "manifest.json").read_text())
+    frames = CalibrationSet(shipped)
+    assert len(frames) == len(manifest["frames"]) >= 20
+    assert {frame["table_kind"] for frame in manifest["frames"]} == set(TABLE_KINDS)
+    for i in range(len(frames)):
+        assert frames[i].image.shape == (480, 640, 3)
+    assert sum(path.stat().st_size for path in shipped.iterdir()) < 3e6
+    check_replaceable(shipped, "manifest.json")
+    demo = manifest["demo"]
+    assert read_frame(shipped / demo["scene"]).shape == (480, 640, 3)
+
+
+def test_the_demo_object_turns_and_moves_as_its_truth_says() -> None:
+    # The bottle is darker than everything on this table.
+    demo = draw_demo(0)
+    gray = [cv2.cvtColor(p, cv2.COLOR_BGR2GRAY) for p in (demo.demonstration, demo.scene)]
+    masks = [(picture < 90).astype(np.uint8) for picture in gray]
+    centers, angles = [], []
+    for mask in masks:
+        (x, y), size, degrees = cv2.minAreaRect(cv2.findNonZero(cv2.medianBlur(mask, 5)))
+        centers.append((x, y))
+        angles.append(-(degrees if size[0] >= size[1] else degrees + 90))
+    assert centers[0] == pytest.approx((320, 240), abs=4)
+    assert centers[1] == pytest.approx(demo.center_px, abs=4)
+    turn = (angles[1] - angles[0] - demo.angle_deg + 90) % 180 - 90
+    assert turn == pytest.approx(0, abs=4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no calibration set, it has no manifest.json"),
+        ("[]", "is damaged"),
+        ("{", "is damaged"),
+        ('{"frames": [{"file": "a"}]}', "is damaged"),
+        ('{"frames": []}', "lists no frames"),
+    ],
+)
+def test_a_folder_that_is_no_calibration_set_is_refused(
+    tmp_path: Path, text: str | None, message: str
+) -> None:
+    if text is not None:
+        (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(QsgmError, match=message):
+        CalibrationSet(tmp_path)
+
+
+def test_an_altered_frame_is_refused(tmp_path: Path) -> None:
+    draw_calibration_set(tmp_path / "set", count=2, seed=3)
+    frames = CalibrationSet(tmp_path / "set")
+    (tmp_path / "set/frame_01.jpg").write_bytes((tmp_path / "set/frame_00.jpg").read_bytes())
+    assert frames[0].center_px == (320, 240)
+    with pytest.raises(QsgmError, match=r"frame_01\.jpg is not the frame the manifest describes"):
+        frames[1]

@@ -1,0 +1,494 @@
+"""The command line: stable keys, one line for every error, and nothing half-written."""
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from qsgm import __version__, cli
+from qsgm.bundle import NETWORK, trunk_file
+from qsgm.errors import QsgmError
+
+FINETUNE_KEYS = {
+    "object",
+    "method",
+    "precision",
+    "layers",
+    "epochs",
+    "seed",
+    "bundle",
+    "output",
+    "detection_accuracy",
+    "angle_mae_deg",
+    "zero_shot",
+    "fidelity",
+    "seconds",
+    "peak_activation_bytes",
+}
+FIDELITY_KEYS = {
+    "cos_int8_float",
+    "cos_int8_true",
+    "cos_float_true",
+    "norm_ratio_int8_true",
+    "sign_agreement_int8_float",
+    "clipped_fraction",
+}
+PREDICT_KEYS = {
+    "object",
+    "quality",
+    "center_px",
+    "displacement_px",
+    "angle_deg",
+    "heatmap_shape",
+    "found",
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict:
+        assert self.code == 0, self.err
+        assert self.out.count("\n") == 1
+        return json.loads(self.out)
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def qsgm(capsys: pytest.CaptureFixture[str]) -> Run:
+    """The command line in this process."""
+
+    def run(*arguments: object) -> Outcome:
+        code = cli.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(code, captured.out, captured.err)
+
+    return run
+
+
+def in_a_process(*arguments: object) -> Outcome:
+    done = subprocess.run(
+        [sys.executable, "-m", "qsgm.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+def assert_refused(outcome: Outcome, code: int, *said: str) -> None:
+    """One line that says what is wrong, and nothing else anywhere."""
+    assert outcome.code == code, outcome.err
+    assert outcome.out == ""
+    assert outcome.err.count("\n") == 1, outcome.err
+    assert "Traceback" not in outcome.err
+    for text in said:
+        assert text in outcome.err
+
+
+@pytest.fixture
+def taught(qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "taught"
+    outcome = qsgm(
+        "finetune", "--epochs", 1, "--bundle", bundle_folder, "-o", folder, "--json", frame_path
+    )
+    assert outcome.code == 0, outcome.err
+    return folder
+
+
+def test_finetune_prints_one_json_object_with_the_stable_keys(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "bar"
+    outcome = qsgm(
+        "finetune", "--json", "--int8", "--epochs", 2, "--seed", 5, "--bundle", bundle_folder,
+        "-o", folder, frame_path,
+    )  # fmt: skip
+    values = outcome.json
+    assert values.keys() >= FINETUNE_KEYS
+    assert outcome.err == ""
+    given = {key: values[key] for key in ("object", "method", "precision", "layers", "epochs")}
+    assert given == {
+        "object": "bar",
+        "method": "sgm",
+        "precision": "int8",
+        "layers": 3,
+        "epochs": 2,
+    }
+    assert (values["seed"], values["output"]) == (5, str(folder))
+    assert values["bundle"] == str(bundle_folder)
+    assert set(values["zero_shot"]) == {"detection_accuracy", "angle_mae_deg"}
+    assert set(values["fidelity"]) == {"4", "5"}
+    assert all(layer.keys() >= FIDELITY_KEYS for layer in values["fidelity"].values())
+    assert values["seconds"].keys() >= {"crops", "features", "tuning", "probes", "total"}
+    assert set(values["peak_activation_bytes"]) == {"sgm", "backprop"}
+
+
+def test_finetune_and_predict_for_people(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    taught = qsgm("finetune", "--epochs", 1, "--bundle", bundle_folder, frame_path)
+    assert taught.code == 0, taught.err
+    for text in ("untouched", "tuned", "cos", "clipped", "seconds: crops", "tuned object: "):
+        assert text in taught.out
+    folder = tmp_path / "data" / "qsgm" / "objects" / "bar"
+    assert str(folder) in taught.out
+    found = qsgm("predict", "-o", tmp_path / "overlay.png", frame_path)
+    assert found.code == 0, found.err
+    assert "bar" in found.out
+    assert "quality" in found.out
+    assert cv2.imread(str(tmp_path / "overlay.png")) is not None
+
+
+def test_predict_prints_one_json_object_with_the_stable_keys(
+    qsgm: Run, taught: Path, frame_path: Path
+) -> None:
+    values = qsgm("predict", "--json", "--object", taught, frame_path).json
+    assert values.keys() >= PREDICT_KEYS
+    assert values["object"] == "bar"
+    assert values["heatmap_shape"] == [3, 23, 33]
+    assert 0 <= values["quality"] <= 1
+    assert -90 < values["angle_deg"] <= 90
+    x, y = values["center_px"]
+    assert values["displacement_px"] == pytest.approx([x - 320, y - 240], abs=0.011)
+
+
+def test_the_object_tuned_last_is_the_one_predict_uses(
+    qsgm: Run, taught: Path, frame_path: Path
+) -> None:
+    assert taught.is_dir()
+    assert qsgm("predict", "--json", frame_path).json["object"] == "bar"
+
+
+def test_predict_writes_nothing_unless_told_to(
+    qsgm: Run, taught: Path, frame_path: Path, tmp_path: Path
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    qsgm("predict", "--object", taught, frame_path)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_object_that_is_not_there_is_reported_and_that_is_no_error(
+    qsgm: Run, taught: Path, tmp_path: Path
+) -> None:
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((480, 640, 3), 200, np.uint8))
+    values = qsgm("predict", "--json", "--object", taught, blank).json
+    assert values["found"] is False
+    assert "not found" in qsgm("predict", "--object", taught, blank).out
+
+
+def test_the_same_seed_prints_the_same_numbers(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    runs = []
+    for name in ("a", "b"):
+        values = qsgm(
+            "finetune", "--json", "--epochs", 1, "--bundle", bundle_folder,
+            "-o", tmp_path / name, frame_path,
+        ).json  # fmt: skip
+        runs.append({key: values[key] for key in values.keys() - {"seconds", "output"}})
+    assert runs[0] == runs[1]
+    networks = [(tmp_path / name / NETWORK).read_bytes() for name in ("a", "b")]
+    assert networks[0] == networks[1]
+
+
+def test_backpropagation_is_reported_as_float(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    outcome = qsgm(
+        "finetune", "--json", "--method", "bp", "--int8", "--epochs", 0, "--bundle",
+        bundle_folder, "-o", tmp_path / "bar", frame_path,
+    )  # fmt: skip
+    assert outcome.json["precision"] == "float"
+    assert outcome.err == "note: backpropagation runs in float; --int8 concerns SGMs only\n"
+
+
+def test_fidelity_prints_the_table_and_keeps_nothing(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    common = ("fidelity", "--epochs", 1, "--bundle", bundle_folder, frame_path)
+    assert "cos" in qsgm(*common).out
+    assert sorted(tmp_path.rglob("*")) == before
+    values = qsgm(*common, "--json", "-o", tmp_path / "report.json").json
+    assert all(layer.keys() >= FIDELITY_KEYS for layer in values["fidelity"].values())
+    assert [probe["epoch"] for probe in values["fidelity_over_run"]] == [0, 1]
+    assert json.loads((tmp_path / "report.json").read_text()) == values
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A small PNG that says it is large."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        checksum = struct.pack(">I", zlib.crc32(kind + body))
+        return struct.pack(">I", len(body)) + kind + body + checksum
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def encoded(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+NOISE = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+BAD_FRAMES = {
+    "empty": b"",
+    "truncated": encoded(NOISE)[:-5000],
+    "text": b"this is a shopping list, not a picture",
+    "tiny": encoded(NOISE[:8, :8]),
+    "flat": encoded(np.full((480, 640, 3), 90, np.uint8)),
+    "huge": png_header(60_000, 60_000),
+}
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", *BAD_FRAMES])
+def test_a_bad_frame_is_refused_in_one_line_and_nothing_is_written(
+    qsgm: Run, kind: str, bundle_folder: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / f"{kind}.png"
+    if kind == "folder":
+        path.mkdir()
+    elif kind != "missing":
+        path.write_bytes(BAD_FRAMES[kind])
+    before = sorted(tmp_path.rglob("*"))
+    folder = tmp_path / "out"
+    outcome = qsgm("finetune", "--bundle", bundle_folder, "-o", folder, path)
+    assert_refused(outcome, 1, "error: ", kind)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("kind", ["grey", "four channels", "16 bit"])
+def test_unusual_pictures_that_show_an_object_are_used(
+    qsgm: Run, kind: str, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    image = cv2.imread(str(frame_path))
+    unusual = {
+        "grey": image[:, :, 1],
+        "four channels": cv2.cvtColor(image, cv2.COLOR_BGR2BGRA),
+        "16 bit": image.astype(np.uint16) * 257,
+    }
+    path = tmp_path / "unusual.png"
+    cv2.imwrite(str(path), unusual[kind])
+    outcome = qsgm(
+        "finetune", "--json", "--epochs", 0, "--bundle", bundle_folder, "-o", tmp_path / "o", path
+    )
+    assert outcome.json["object"] == "unusual"
+
+
+USAGE_ERRORS = [
+    ("--layers", "99"),
+    ("--layers", "0"),
+    ("--epochs", "-1"),
+    ("--epochs", "many"),
+    ("--seed", "abc"),
+    ("--seed", "-1"),
+    ("--center", "5"),
+    ("--center", "5,x"),
+    ("--center", "1,2,3"),
+    ("--method", "magic"),
+    ("--optimizer", "lion"),
+    ("--threads", "0"),
+    ("--no-such-option", "1"),
+]
+
+
+@pytest.mark.parametrize(("option", "value"), USAGE_ERRORS)
+def test_a_value_out_of_range_is_a_usage_error_in_one_line(
+    qsgm: Run, option: str, value: str, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    outcome = qsgm("finetune", option, value, "--bundle", bundle_folder, frame_path)
+    assert_refused(outcome, 2, option, "see `qsgm finetune --help`")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("arguments", [(), ("a.png", "b.png")])
+def test_a_wrong_number_of_frames_is_a_usage_error(qsgm: Run, arguments: tuple[str, ...]) -> None:
+    assert_refused(qsgm("finetune", *arguments), 2)
+
+
+def test_an_unknown_command_is_a_usage_error(qsgm: Run) -> None:
+    assert_refused(qsgm("fine-tune"), 2, "fine-tune", "see `qsgm --help`")
+
+
+def test_a_centre_whose_window_leaves_the_frame_is_refused(
+    qsgm: Run, frame_path: Path, bundle_folder: Path
+) -> None:
+    for center in ("10,10", "-5,240", "nan,nan", "inf,240"):
+        outcome = qsgm("finetune", "--bundle", bundle_folder, "--center", center, frame_path)
+        assert_refused(outcome, 1, "closer than 64 px to the border", "--center")
+
+
+def test_a_spoilt_bundle_is_refused_in_one_line(
+    qsgm: Run, frame_path: Path, own_bundle: Path, tmp_path: Path
+) -> None:
+    command = ("finetune", "--bundle", own_bundle, "-o", tmp_path / "out", frame_path)
+    (own_bundle / trunk_file(3)).write_bytes(b"altered")
+    assert_refused(qsgm(*command), 1, "trunk_3.onnx", "qsgm fold-and-quantize")
+    (own_bundle / trunk_file(3)).unlink()
+    assert_refused(qsgm(*command), 1, "lacks trunk_3.onnx")
+    (own_bundle / "manifest.json").unlink()
+    assert_refused(qsgm(*command), 1, "manifest.json")
+    missing = ("finetune", "--bundle", tmp_path / "nowhere", frame_path)
+    assert_refused(qsgm(*missing), 1, "there is no such folder")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_in_the_way_is_noticed_before_anything_runs(
+    qsgm: Run, bundle_folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    outcome = qsgm(
+        "finetune", "--bundle", bundle_folder, "-o", tmp_path / "mine", tmp_path / "missing.png"
+    )
+    assert_refused(outcome, 1, "did not write 'thesis.txt'")
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+
+
+def test_predict_without_any_object_says_what_to_run(qsgm: Run, frame_path: Path) -> None:
+    assert_refused(qsgm("predict", frame_path), 1, "qsgm finetune object.png")
+
+
+def test_predict_with_something_else_as_object_is_refused(
+    qsgm: Run, frame_path: Path, bundle_folder: Path
+) -> None:
+    assert_refused(qsgm("predict", "--object", bundle_folder, frame_path), 1, "object.json")
+
+
+def test_a_name_with_a_line_break_still_makes_one_line(qsgm: Run, tmp_path: Path) -> None:
+    assert_refused(qsgm("predict", "--object", tmp_path / "a\nb", "x.png"), 1)
+
+
+def test_an_output_that_cannot_be_written_is_refused(
+    qsgm: Run, taught: Path, frame_path: Path, tmp_path: Path
+) -> None:
+    outcome = qsgm("predict", "--object", taught, "-o", tmp_path, frame_path)
+    assert_refused(outcome, 1, "cannot write")
+
+
+def test_host_commands_say_what_to_install_when_torch_is_missing(
+    qsgm: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_torch(_: str) -> None:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
+
+    monkeypatch.setattr(cli, "importlib", SimpleNamespace(import_module=without_torch))
+    for command in (("pretrain",), ("fold-and-quantize", "sgm.pt")):
+        assert_refused(qsgm(*command), 1, "needs torch", "pip install 'qsgm[train]'")
+
+
+def test_a_bug_is_not_hidden(qsgm: Run, monkeypatch: pytest.MonkeyPatch, frame_path: Path) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "_bundle", broken)
+    with pytest.raises(ZeroDivisionError):
+        qsgm("finetune", frame_path)
+
+
+def test_the_progress_says_nothing_unless_it_is_on_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with cli._progress() as watch:
+        watch("crops", 1, 2)
+        watch("meta", 1, 2, {"loss": 0.5})
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_version_and_the_help_are_printed(qsgm: Run) -> None:
+    assert qsgm("--version").out == f"qsgm {__version__}\n"
+    assert "finetune" in qsgm("--help").out
+    assert "finetune" in qsgm().out
+    for command in ("finetune", "predict", "fidelity", "pretrain", "fold-and-quantize"):
+        assert qsgm(command, "--help").code == 0
+
+
+def test_exit_codes_and_single_lines_hold_in_a_process_of_its_own(
+    bundle_folder: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "empty.png"
+    path.write_bytes(b"")
+    outcome = in_a_process("finetune", "--bundle", bundle_folder, path)
+    assert_refused(outcome, 1, "empty.png")
+    assert_refused(in_a_process("finetune", "--layers", 99, path), 2, "--layers")
+
+
+def test_json_is_all_there_is_on_stdout_of_a_process(
+    bundle_folder: Path, frame_path: Path, tmp_path: Path
+) -> None:
+    outcome = in_a_process(
+        "finetune", "--json", "--epochs", 1, "--bundle", bundle_folder,
+        "-o", tmp_path / "bar", frame_path,
+    )  # fmt: skip
+    assert outcome.json["object"] == "bar"
+    assert outcome.err == ""
+
+
+def test_an_interrupt_exits_with_130_and_writes_nothing(
+    qsgm: Run,
+    bundle_folder: Path,
+    frame_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(sys.modules["qsgm.finetune"], "tune", interrupted)
+    outcome = qsgm("finetune", "--bundle", bundle_folder, "-o", tmp_path / "out", frame_path)
+    assert (outcome.code, outcome.out, outcome.err) == (130, "", "interrupted\n")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_reader_that_goes_away_makes_no_noise(taught: Path, frame_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qsgm.cli", "predict", "--object", str(taught), str(frame_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    err = process.stderr.read()
+    process.wait(timeout=30)
+    process.stderr.close()
+    assert err == ""
+
+
+def test_an_object_that_cannot_be_remembered_is_still_written(
+    qsgm: Run,
+    frame_path: Path,
+    bundle_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(_: Path) -> None:
+        raise QsgmError("no home")
+
+    monkeypatch.setattr(cli.paths, "remember_object", fail)
+    outcome = qsgm(
+        "finetune", "--json", "--epochs", 0, "--bundle", bundle_folder,
+        "-o", tmp_path / "bar", frame_path,
+    )  # fmt: skip
+    assert outcome.json["output"] == str(tmp_path / "bar")
+    assert "will need --object" in outcome.err
+    assert (tmp_path / "bar" / NETWORK).is_file()

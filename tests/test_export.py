@@ -1,0 +1,249 @@
+"""From checkpoint to bundle: it loads, it holds the numbers, and nothing else is left behind."""
+
+import json
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from rich.console import Console
+
+from qsgm import QsgmError
+from qsgm.bundle import Bundle, load_bundle
+from qsgm.train import calibrate, export
+from qsgm.train.checkpoint import Checkpoint, save_checkpoint
+from qsgm.train.draw_calibration import draw_calibration_set
+from qsgm.train.export import fold_and_quantize
+from qsgm.train.export_report import ExportReport
+from qsgm.train.fold import fold_net
+from qsgm.train.graphs.inspection import refuse_float_products
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.sgm import Sgm
+from qsgm.tuning import StepLoop
+from qsgm.weights import to_step_layout
+
+RATES = {1: (4e-3,), 2: (2e-3, 3e-3), 3: (1e-3, 2e-3, 3e-3)}
+GRAPHS = {
+    "network.onnx",
+    *(f"{kind}_{n}.onnx" for kind in ("trunk", "head") for n in (1, 2, 3)),
+    *(f"step_bp_{optimizer}_{n}.onnx" for optimizer in ("sgd", "adam") for n in (1, 2, 3)),
+    *(
+        f"step_sgm_{precision}_{optimizer}_{n}.onnx"
+        for precision in ("int8", "float")
+        for optimizer in ("sgd", "adam")
+        for n in (2, 3)
+    ),
+    "probe_2.onnx",
+    "probe_3.onnx",
+}
+FIDELITY = {
+    "cos_int8_float",
+    "cos_int8_true",
+    "cos_float_true",
+    "norm_ratio_int8_true",
+    "sign_agreement_int8_float",
+    "sqnr_db",
+    "clipped_fraction",
+}
+
+
+def ignore(_stage: str, _done: int, _of: int) -> None:
+    pass
+
+
+class Workplace:
+    """A tiny checkpoint, a tiny calibration set, and exports of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        torch.manual_seed(0)
+        self.net = GraspNet().eval()
+        sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
+        self.checkpoint = Checkpoint(self.net, sgms, Loss(), RATES, {"seed": 11})
+        save_checkpoint(folder / "sgm.pt", self.checkpoint)
+        draw_calibration_set(folder / "calib", count=2, seed=5)
+
+    def export(self, name: str) -> ExportReport:
+        paths = (self.folder / part for part in ("sgm.pt", "calib", name))
+        return fold_and_quantize(*paths, ignore, epochs=1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_and_on_one_thread() -> Iterator[None]:
+    """Threads that wait for each other on a busy machine take longer than this work does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrate, "CROPS", 70)
+        yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Workplace:
+    return Workplace(tmp_path_factory.mktemp("export"))
+
+
+@pytest.fixture(scope="module")
+def report(workplace: Workplace, small_and_on_one_thread: None) -> ExportReport:  # noqa: ARG001
+    return workplace.export("first")
+
+
+@pytest.fixture(scope="module")
+def bundle(report: ExportReport) -> Bundle:
+    return load_bundle(Path(report.output))
+
+
+def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
+    assert set(bundle.manifest["files"]) == GRAPHS
+    others = {"manifest.json", "README.md", "SHA256SUMS"}
+    assert {path.name for path in bundle.folder.iterdir()} == GRAPHS | others
+    for name in GRAPHS:
+        assert bundle.manifest["files"][name]["bytes"] == (bundle.folder / name).stat().st_size
+        onnx.checker.check_model(onnx.load(bundle.folder / name), full_check=True)
+
+
+def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:
+    assert (bundle.encoding, bundle.label_smoothing, bundle.most_layers) == ("double", 0.05, 3)
+    for tuned in (2, 3):
+        assert bundle.recipe("sgm", tuned, None).optimizer == "sgd"
+        assert bundle.recipe("sgm", tuned, None).rates == RATES[tuned]
+        assert bundle.recipe("sgm", tuned, "adam").rates == (3e-4,) * tuned
+    assert bundle.recipe("sgm", 1, None) == bundle.recipe("bp", 1, "adam")
+    assert bundle.recipe("bp", 3, None).rates == (1e-3,) * 3
+    assert bundle.recipe("bp", 3, "sgd").rates == (1e-2,) * 3
+
+
+def test_start_weights_are_the_folded_checkpoints(workplace: Workplace, bundle: Bundle) -> None:
+    weights = bundle.start_weights(3)
+    folded = fold_net(workplace.net)
+    assert len(weights) == 6
+    for number in (4, 5, 6):
+        layer = folded.layers[number - 1]
+        np.testing.assert_array_equal(weights[f"weight{number}"], layer.weight)
+        np.testing.assert_array_equal(weights[f"bias{number}"], layer.bias)
+    assert bundle.network_with(weights) == (bundle.folder / "network.onnx").read_bytes()
+
+
+@pytest.mark.parametrize("precision", ["int8", "float"])
+@pytest.mark.parametrize("optimizer", ["sgd", "adam"])
+@pytest.mark.parametrize("tuned", [2, 3])
+def test_exported_steps_train(bundle: Bundle, tuned: int, optimizer: str, precision: str) -> None:
+    session = bundle.session(f"step_sgm_{precision}_{optimizer}_{tuned}.onnx")
+    rng = np.random.default_rng(0)
+    features = rng.random((40, 169 if tuned == 3 else 1, 16), np.float32)
+    labels = rng.uniform(0, 1, (40, 3)).astype(np.float32)
+    start = {
+        name: to_step_layout(value) if value.ndim > 1 else value
+        for name, value in bundle.start_weights(tuned).items()
+    }
+    loop = StepLoop(session, features, labels, start, dict.fromkeys(range(7 - tuned, 7), 1e-2))
+    losses = [loop.step(rng.permutation(40)[:32]) for _ in range(5)]
+    assert np.isfinite(losses).all()
+    assert not np.array_equal(loop.weights()["weight6"], start["weight6"])
+
+
+def test_the_report_has_its_keys(workplace: Workplace, report: ExportReport) -> None:
+    values = report.to_json()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert values["output"] == str(workplace.folder / "first")
+    assert values["calibrator"] == {"4": "minmax", "5": "minmax"}
+    assert set(values["layers"]) == {"4", "5"}
+    for layer in values["layers"].values():
+        assert set(layer) >= FIDELITY | {"range", "bytes"}
+    assert values["fold_max_abs_error"] < 1e-4
+    # (19*8+8) + (8*6+6) + (6*16+16) numbers; in int8 10 numbers per channel come on top.
+    assert values["bytes"]["float"] == 2 * 4 * (160 + 54 + 112)
+    assert values["bytes"]["int8"] == 2 * (152 + 48 + 96 + 8 * (8 + 6 + 16) + 8 * 19)
+    sizes = [(workplace.folder / "first" / name).stat().st_size for name in GRAPHS]
+    assert values["bundle_bytes"] == sum(sizes)
+
+
+def test_the_table_and_the_model_card_show_every_layer(
+    workplace: Workplace, report: ExportReport
+) -> None:
+    shown = StringIO()
+    Console(file=shown, width=160).print(report)
+    card = (workplace.folder / "first/README.md").read_text()
+    for layer, one in report.layers.items():
+        cosine = f"{one.fidelity.cos_int8_float:.5f}"
+        assert f"| {layer} | " in card
+        assert cosine in card
+        assert cosine in shown.getvalue()
+    assert '"seed": 11' in card
+
+
+def test_the_same_checkpoint_gives_the_same_bytes(
+    workplace: Workplace, report: ExportReport
+) -> None:
+    workplace.export("second")
+    first, second = Path(report.output), workplace.folder / "second"
+    for path in first.iterdir():
+        assert path.read_bytes() == (second / path.name).read_bytes(), path.name
+    workplace.export("second")  # an earlier bundle is replaced
+
+
+@pytest.mark.parametrize("change", ["missing", "altered"])
+def test_a_missing_or_altered_graph_is_refused(
+    workplace: Workplace, tmp_path: Path, report: ExportReport, change: str
+) -> None:
+    copy = tmp_path / "bundle"
+    copy.mkdir()
+    for path in Path(report.output).iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    load_bundle(copy)
+    if change == "missing":
+        (copy / "probe_2.onnx").unlink()
+    else:
+        (copy / "probe_2.onnx").write_bytes((copy / "probe_3.onnx").read_bytes())
+    with pytest.raises(QsgmError, match=r"probe_2\.onnx"):
+        load_bundle(copy)
+    assert workplace.folder.is_dir()
+
+
+def test_a_failure_leaves_nothing_behind(
+    workplace: Workplace, report: ExportReport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sorted(path.name for path in workplace.folder.iterdir())
+    kept = (Path(report.output) / "manifest.json").read_bytes()
+
+    def fail(*_: Any) -> str:
+        raise QsgmError("no card today")
+
+    monkeypatch.setattr(export, "model_card", fail)
+    for name in ("first", "third"):
+        with pytest.raises(QsgmError, match="no card today"):
+            workplace.export(name)
+    assert sorted(path.name for path in workplace.folder.iterdir()) == before
+    assert (Path(report.output) / "manifest.json").read_bytes() == kept
+
+
+def test_a_folder_with_something_else_is_refused_before_any_work(
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "load_checkpoint", pytest.fail)
+    with pytest.raises(QsgmError, match=r"it holds another kind of output|did not write"):
+        fold_and_quantize(Path("sgm.pt"), Path("calib"), workplace.folder, ignore)
+
+
+def test_folding_that_changes_outputs_is_refused(workplace: Workplace) -> None:
+    trainee = calibrate.prepare(workplace.checkpoint)
+    frame = calibrate.CalibrationSet(workplace.folder / "calib")[0]
+    assert export.check_folding(trainee, frame) < 1e-4
+    trainee.sgms[5].convs[1].bias[0] += 0.1
+    with pytest.raises(QsgmError, match="folding batchnorm changes the SGM behind layer 5"):
+        export.check_folding(trainee, frame)
+
+
+def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> None:
+    model = onnx.load(bundle.folder / "step_sgm_int8_sgd_3.onnx")
+    refuse_float_products("step", model)
+    # ONNX Runtime has no integer product with a factor on its sum.
+    gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][2]
+    gemm.attribute.append(onnx.helper.make_attribute("alpha", 2.0))
+    with pytest.raises(QsgmError, match=r"step: .* computes 2 of the 3 int8 products of layer5"):
+        refuse_float_products("step", model)

@@ -1,0 +1,250 @@
+"""Fine-tuning end to end on a small bundle: deterministic, honest, and the same at every seam."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from qsgm import QsgmError, finetune, load_bundle, load_object
+from qsgm.angles import encode_angle
+from qsgm.bundle import Bundle, head_file, step_file
+from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
+from qsgm.finetune import (
+    Accuracy,
+    FinetuneResult,
+    Probe,
+    Settings,
+    accuracy_of,
+    drift_warnings,
+    peak_activation_bytes,
+    prepare,
+    train,
+)
+from qsgm.report import finetune_json, to_json
+from qsgm.weights import to_step_layout
+
+Frame = NDArray[np.uint8]
+SHORT = Settings(epochs=2)
+
+
+@pytest.fixture(scope="module")
+def result(frame: Frame, bundle: Bundle) -> FinetuneResult:
+    return finetune(frame, bundle, SHORT)
+
+
+def test_the_same_seed_gives_the_same_result(
+    frame: Frame, bundle: Bundle, result: FinetuneResult
+) -> None:
+    again = finetune(frame, bundle, SHORT)
+    assert again.network() == result.network()
+    assert (again.accuracy, again.losses, again.probes) == (
+        result.accuracy,
+        result.losses,
+        result.probes,
+    )
+
+
+def test_another_seed_gives_other_crops(
+    frame: Frame, bundle: Bundle, result: FinetuneResult
+) -> None:
+    other = finetune(frame, bundle, replace(SHORT, seed=1, epochs=1))
+    assert not np.array_equal(other.prepared.labels, result.prepared.labels)
+
+
+def test_crops_cut_in_slices_have_the_features_of_crops_cut_at_once(
+    frame: Frame, bundle: Bundle, result: FinetuneResult
+) -> None:
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
+    crops = cut_crops(frame, plan[:60])
+    expected = bundle.session("trunk_3.onnx").run(None, {"crops": crops})[0]
+    assert len(result.prepared.features) == CROPS
+    np.testing.assert_allclose(result.prepared.features[:60], expected, atol=1e-5)
+
+
+def test_the_object_may_lie_elsewhere_in_the_frame(frame: Frame, bundle: Bundle) -> None:
+    prepared = prepare(frame, bundle, replace(SHORT, center_px=(250.0, 280.0)))
+    plan = plan_crops((480, 640), (250, 280), np.random.default_rng(0))
+    crops = cut_crops(frame, plan[:20])
+    expected = bundle.session("trunk_3.onnx").run(None, {"crops": crops})[0]
+    np.testing.assert_allclose(prepared.features[:20], expected, atol=1e-5)
+    with pytest.raises(QsgmError, match="closer than 64 px to the border"):
+        prepare(frame, bundle, replace(SHORT, center_px=(30.0, 240.0)))
+
+
+def test_labels_are_shifted_by_the_orientation_the_network_sees(result: FinetuneResult) -> None:
+    prepared = result.prepared
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
+    positive = plan.quality > 0
+    expected = encode_angle(plan.turn_rad + np.float32(prepared.offset_rad))
+    np.testing.assert_allclose(prepared.labels[positive, 1:], expected[positive], atol=1e-5)
+    assert (prepared.labels[~positive] == 0).all()
+    assert 0 <= prepared.offset_strength <= 1
+
+
+def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180(bundle: Bundle) -> None:
+    angles = np.radians([10.0, 80.0, 0.0, 0.0])
+    labels = np.array([[1, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]], np.float32)
+    seen = np.concatenate(
+        [
+            np.array([[0.9], [0.4], [0.8], [0.1]], np.float32),
+            encode_angle(np.radians([12.0, -96.0, 50.0, 50.0])),
+        ],
+        axis=1,
+    )
+    accuracy = accuracy_of(seen, labels, angles, bundle)
+    assert accuracy.detection_accuracy == 0.5
+    assert accuracy.angle_mae_deg == pytest.approx((2 + 4) / 2, abs=1e-4)
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+@pytest.mark.parametrize("method", ["sgm", "bp"])
+def test_every_method_tunes_every_number_of_layers(
+    frame: Frame, bundle: Bundle, layers: int, method: str
+) -> None:
+    settings = Settings(method=method, layers=layers, epochs=1)  # type: ignore[arg-type]
+    result = finetune(frame, bundle, settings)
+    assert set(result.fidelity) == set(bundle.sgm_layers(layers))
+    assert len(result.probes) == (2 if layers > 1 else 0)
+    start = bundle.start_weights(layers)
+    assert set(result.weights) == set(start)
+    assert all(result.weights[name].shape == start[name].shape for name in start)
+    assert any(not np.array_equal(result.weights[name], start[name]) for name in start)
+    assert result.settings.precision == ("float" if method == "bp" else "int8")
+
+
+def test_backpropagation_lowers_the_loss(frame: Frame, bundle: Bundle) -> None:
+    result = finetune(frame, bundle, Settings(method="bp", epochs=6))
+    assert result.losses[-1] < 0.9 * result.losses[0]
+    assert result.accuracy.detection_accuracy > result.zero_shot.detection_accuracy
+
+
+def test_no_epochs_leave_the_network_as_it_was(frame: Frame, bundle: Bundle) -> None:
+    result = finetune(frame, bundle, Settings(epochs=0))
+    assert result.accuracy == result.zero_shot
+    assert result.network() == (bundle.folder / "network.onnx").read_bytes()
+    assert result.losses == ()
+
+
+def test_the_tuned_network_answers_like_the_head_with_the_final_weights(
+    frame: Frame, result: FinetuneResult, tmp_path: Path
+) -> None:
+    result.save(tmp_path / "mug", "mug")
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
+    crops = cut_crops(frame, plan[TRAIN_CROPS : TRAIN_CROPS + 20])
+    weights = {
+        name: to_step_layout(value) if value.ndim > 1 else value
+        for name, value in result.weights.items()
+    }
+    features = result.prepared.features[TRAIN_CROPS : TRAIN_CROPS + 20]
+    head = result.prepared.bundle.session(head_file(3))
+    expected = head.run(None, {"features": features, **weights})[0]
+    tuned = load_object(tmp_path / "mug")
+    got = np.stack([tuned.heatmap(crop)[:, 0, 0] for crop in crops])
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+
+
+def test_a_saved_object_and_the_one_in_memory_find_the_same(
+    frame: Frame, result: FinetuneResult, tmp_path: Path
+) -> None:
+    result.save(tmp_path / "mug", "mug")
+    saved = load_object(tmp_path / "mug").locate(frame)[0]
+    assert saved == result.tuned_object().locate(frame)[0]
+
+
+def test_the_report_beside_the_object_keeps_the_whole_run(
+    result: FinetuneResult, tmp_path: Path
+) -> None:
+    result.save(tmp_path / "mug", "mug")
+    report = json.loads((tmp_path / "mug" / "report.json").read_text())
+    assert [probe["epoch"] for probe in report["fidelity_over_run"]] == [0, 1, 2]
+    assert len(report["loss"]) == 2
+    mean = np.mean([probe["4"]["cos_int8_true"] for probe in report["fidelity_over_run"]])
+    assert report["fidelity"]["4"]["cos_int8_true"] == pytest.approx(mean, abs=1e-4)
+
+
+def test_stages_add_up_to_no_more_than_the_total(result: FinetuneResult) -> None:
+    seconds = dict(result.seconds)
+    total = seconds.pop("total")
+    assert set(seconds) == {"crops", "features", "tuning", "probes"}
+    assert all(value > 0 for value in seconds.values())
+    assert sum(seconds.values()) <= total
+
+
+def test_preparing_once_and_training_twice_equals_two_whole_runs(
+    frame: Frame, bundle: Bundle, result: FinetuneResult
+) -> None:
+    prepared = prepare(frame, bundle, SHORT)
+    train(prepared, replace(SHORT, method="bp"))
+    second = train(prepared, SHORT, probe=False)
+    assert second.network() == result.network()
+    assert second.probes == ()
+    with pytest.raises(ValueError, match="prepared for 3 layers, not for 2"):
+        train(prepared, replace(SHORT, layers=2))
+
+
+def test_progress_is_told_stage_by_stage(frame: Frame, bundle: Bundle) -> None:
+    told: list[tuple[str, int, int]] = []
+    finetune(frame, bundle, SHORT, lambda *what: told.append(what))
+    assert told[0] == ("crops", 50, CROPS)
+    assert told[-2:] == [("tuning", 1, 2), ("tuning", 2, 2)]
+
+
+def test_training_that_diverges_names_the_step_and_what_to_do(
+    frame: Frame, own_bundle: Path
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["3"] = [1e30, 1e30, 1e30]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(QsgmError, match=r"diverged: .* at step \d+; nothing .* another --method"):
+        finetune(frame, load_bundle(own_bundle), SHORT)
+
+
+def test_more_layers_than_the_bundle_has_are_refused(frame: Frame, bundle: Bundle) -> None:
+    small = replace(bundle, manifest=bundle.manifest | {"most_layers": 2})
+    with pytest.raises(QsgmError, match="2 layers at most, not 3; pass --layers 2"):
+        finetune(frame, small, SHORT)
+
+
+def test_what_is_no_frame_is_a_programming_error(frame: Frame, bundle: Bundle) -> None:
+    with pytest.raises(ValueError, match=r"`frame` must be uint8 \(H, W, 3\), got float64"):
+        finetune(frame / 255.0, bundle)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`frame` must be"):
+        finetune(frame[:, :, 0], bundle)
+
+
+def test_an_object_unlike_the_calibration_set_is_named(result: FinetuneResult) -> None:
+    assert drift_warnings(result) == result.warnings == ()
+    probe = result.probes[0]
+    clipped = {k: replace(v, clipped_fraction=0.08) for k, v in probe.layers.items()}
+    far = replace(result, probes=(Probe(0, clipped),))
+    first, second = drift_warnings(far)
+    assert first.startswith("layer 4: 8.0 % of what its int8 SGM saw")
+    assert second.startswith("layer 5:")
+    in_float = replace(far, settings=replace(SHORT, precision="float"))
+    assert drift_warnings(in_float) == ()
+
+
+def test_activations_are_counted_as_documented() -> None:
+    last_three = [4 * 32 * n for n in (16 * 51, 32, 3)]
+    assert peak_activation_bytes(3) == {"sgm": last_three[0], "backprop": sum(last_three)}
+    assert peak_activation_bytes(1) == {"sgm": 4 * 32 * 3, "backprop": 4 * 32 * 3}
+
+
+def test_int8_and_float_sgms_run_different_graphs(frame: Frame, bundle: Bundle) -> None:
+    assert step_file("sgm", "int8", "sgd", 3) != step_file("sgm", "float", "sgd", 3)
+    prepared = prepare(frame, bundle, SHORT)
+    floating = train(prepared, replace(SHORT, precision="float")).weights["weight4"]
+    integers = train(prepared, SHORT).weights["weight4"]
+    assert not np.array_equal(floating, integers)
+    np.testing.assert_allclose(floating, integers, atol=0.05)
+
+
+def test_a_number_that_is_not_finite_becomes_null_not_nan(result: FinetuneResult) -> None:
+    broken = replace(result, accuracy=Accuracy(1.0, math.nan))
+    values = json.loads(to_json(finetune_json(broken, "mug", Path("mug"))))
+    assert values["angle_mae_deg"] is None

@@ -1,0 +1,51 @@
+"""The tuned layers' start, out of the network and back."""
+
+import copy
+
+import torch
+
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.local import outputs
+from qsgm.train.start import folded_start, write_back
+from qsgm.train.tasks import start_states
+
+
+def net_with_statistics(seed: int) -> GraspNet:
+    """A network whose batchnorms are far from the identity."""
+    torch.manual_seed(seed)
+    net = GraspNet()
+    for layer in net.layers:
+        if layer.norm is not None:
+            layer.norm.running_mean.normal_()
+            layer.norm.running_var.uniform_(0.3, 3.0)
+            torch.nn.init.uniform_(layer.norm.weight, 0.5, 2.0)
+            torch.nn.init.normal_(layer.norm.bias)
+    return net.eval()
+
+
+@torch.no_grad()
+def test_the_folded_start_answers_as_the_network_does() -> None:
+    net = net_with_statistics(0)
+    maps = torch.rand(4, 16, 13, 13)
+    features = maps.flatten(2).transpose(1, 2)[None]
+    raw = outputs(start_states(folded_start(net, 3), 1), features)[0]
+    torch.testing.assert_close(raw, net.between(maps, 4, 6)[:, :, 0, 0], atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_what_is_written_back_folds_to_what_was_learnt() -> None:
+    net = net_with_statistics(1)
+    learnt = [(w + torch.randn_like(w), b + 1.0) for w, b in folded_start(net, 3)]
+    frozen = copy.deepcopy(net.layers[:3].state_dict())
+    write_back(net, learnt)
+    for (weight, bias), (wanted, wanted_bias) in zip(folded_start(net, 3), learnt, strict=True):
+        torch.testing.assert_close(weight, wanted, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(bias, wanted_bias, atol=1e-5, rtol=1e-4)
+    for name, value in net.layers[:3].state_dict().items():
+        assert torch.equal(value, frozen[name])
+
+
+def test_the_loss_takes_its_encoding_from_its_name() -> None:
+    raw = torch.tensor([[0.0, 0.0, 0.0]])
+    assert Loss("double").activate(raw)[0].tolist() == [0.5, 0.0, 0.0]
+    assert Loss("paper").activate(raw)[0].tolist() == [0.5, 0.0, 0.5]

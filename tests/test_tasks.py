@@ -1,0 +1,82 @@
+"""Drawn training data, alignment, scores and recorded gradients."""
+
+import numpy as np
+import pytest
+import torch
+
+from qsgm.angles import angle_error, decode_angle, encode_angle
+from qsgm.crops import label_crops, plan_crops
+from qsgm.train.evaluate import Score, best_rates, score
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.local import true_gradients
+from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.sgm import Sgm
+from qsgm.train.start import folded_start
+from qsgm.train.tasks import CropStream, TaskSet, axis_offset, draw_tasks, start_states
+
+
+def raw_for(angle_rad: np.ndarray, quality: np.ndarray) -> torch.Tensor:
+    """Raw outputs of a network that sees these angles and qualities."""
+    channels = np.arctanh(0.99 * encode_angle(angle_rad))
+    return torch.tensor(np.concatenate([8 * (quality[:, None] - 0.5), channels], axis=1))
+
+
+@pytest.mark.parametrize("offset", [-1.2, 0.0, 0.7, 1.5])
+def test_the_offset_is_how_the_network_sees_the_demonstration_turned(offset: float) -> None:
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 200)
+    raw = raw_for(plan.turn_rad + offset, plan.quality)
+    assert angle_error(np.array(axis_offset(raw, plan, Loss())), np.array(offset)) < 1e-3
+
+
+def test_a_drawn_batch_depends_on_its_number_and_seed_only() -> None:
+    crops, labels = CropStream(5, 10, 6)[3]
+    again, labels_again = CropStream(5, 10, 6)[3]
+    other, _ = CropStream(6, 10, 6)[3]
+    assert torch.equal(crops, again)
+    assert torch.equal(labels, labels_again)
+    assert not torch.equal(crops, other)
+    assert crops.shape == (6, 128, 128, 3)
+
+
+def test_the_score_agrees_with_numpy() -> None:
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(1), 60)
+    labels = torch.tensor(label_crops(plan))[None]
+    generator = torch.Generator().manual_seed(0)
+    # Layers that pass three features through, so that the features are the raw outputs.
+    raw = torch.randn(1, 60, 3, generator=generator)
+    start = [(torch.eye(3), torch.zeros(3))]
+    tasks = TaskSet(raw[:, :, None].double(), labels, support=20)
+    got = score(start_states(start, 1), tasks, Loss())[0].tolist()
+    seen = Loss().activate(raw[0])[20:].numpy()
+    positive = labels[0, 20:, 0].numpy() > 0
+    predicted = decode_angle(seen[:, 1], seen[:, 2])
+    error = np.degrees(angle_error(predicted, plan.turn_rad[20:]))[positive].mean()
+    assert got[0] == pytest.approx(float(Loss()(raw[0, 20:], labels[0, 20:])), rel=1e-5)
+    assert got[1] == pytest.approx(((seen[:, 0] > 0.5) == positive).mean())
+    assert got[2] == pytest.approx(error, rel=1e-4)
+
+
+def test_the_best_rates_are_those_with_the_lowest_finite_loss() -> None:
+    losses = {(1.0,): 3.0, (2.0,): float("nan"), (3.0,): 2.0}
+    assert best_rates({rates: Score(loss, 0.0, 0.0) for rates, loss in losses.items()}) == (3.0,)
+
+
+def test_recorded_examples_hold_true_gradients_and_an_sgm_learns_them() -> None:
+    torch.manual_seed(0)
+    net, loss = GraspNet().eval(), Loss()
+    tasks = draw_tasks(net, 2, 80, 9, loss, lambda: None)
+    start = folded_start(net, 3)
+    config = MatchingConfig(epochs=1, record_every=1, fit_steps=150, fit_batch=64)
+    examples = record_examples(tasks, start, (0.0, 0.0, 0.0), loss, config, seed=0)
+    rows = torch.randperm(64, generator=torch.Generator().manual_seed(0))[:32]
+    states = start_states(start, 2)
+    features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
+    true = true_gradients(states, features, labels, loss)
+    torch.testing.assert_close(examples[5].labels[:64], labels.flatten(0, 1))
+    torch.testing.assert_close(examples[5].gradients[:64], true[5].flatten(0, 2))
+    sgm = fit_sgm(Sgm(5, (32,)), examples[5], config, 0, lambda: None)
+    given = sgm(examples[5].activations[..., None, None], examples[5].labels)[:, :, 0, 0]
+    alike = torch.nn.functional.cosine_similarity(
+        given.flatten(), examples[5].gradients.flatten(), dim=0
+    )
+    assert alike > 0.9
