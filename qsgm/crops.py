@@ -160,7 +160,7 @@ def _ring(
     offset: NDArray[np.float64] = radius[:, None] * np.stack(
         [np.cos(direction), np.sin(direction)], axis=-1
     )
-    return offset + np.asarray(center_px)
+    return np.add(offset, center_px)
 
 
 def _anywhere(

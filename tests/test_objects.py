@@ -4,10 +4,10 @@ import pytest
 
 from qsgm.angles import angle_error
 from qsgm.errors import QsgmError
+from qsgm.train.drawing.parts import Part, box
+from qsgm.train.drawing.render import Light, fitted, render
+from qsgm.train.drawing.shapes import COMPACT, ELONGATED
 from qsgm.train.objects import OBJECT_KINDS, TABLE_KINDS, DrawnFrame, draw_frame
-from qsgm.train.parts import Part, box
-from qsgm.train.render import Light, fitted, render
-from qsgm.train.shapes import COMPACT, ELONGATED
 
 
 def drawn(seed: int, **kinds: str) -> DrawnFrame:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import RenderableType
 
 from qsgm.angles import angle_error
@@ -24,7 +25,7 @@ from qsgm.report import number, plain_table
 
 # A detection this close to the true centre is one of the object.
 ON_OBJECT_PX = 24.0
-# Pictures of the first frames are enough to see what is going on.
+# Pictures of so many frames, evenly spread, show what is going on; false detections always do.
 PICTURES_OF_FRAMES = 6
 
 
@@ -105,7 +106,7 @@ class ScenesReport:
     def render(self) -> RenderableType:
         """The summary, line by line."""
         values = self.summary()
-        table = plain_table("scenes made from demonstrations")
+        table = plain_table("objects looked for in scenes")
         table.show_header = False
         table.add_column()
         table.add_column(justify="right")
@@ -136,25 +137,24 @@ def measure_scenes(
         settings: how to tune; the seed also makes the scenes.
         count: scenes per frame.
         watch: told about every frame.
-        pictures: folder for pictures of what was found in the first frames' scenes.
+        pictures: folder for pictures of some frames' scenes and of every false detection.
     """
     results: list[SceneResult] = []
-    for done, frame in enumerate(frames, start=1):
-        folder = pictures if done <= PICTURES_OF_FRAMES else None
-        results += measure_frame(frame, bundle, settings, count, done, folder)
-        watch("frames", done, len(frames))
+    every = max(1, len(frames) // PICTURES_OF_FRAMES)
+    for i, frame in enumerate(frames):
+        some, heatmaps = measure_frame(frame, bundle, settings, count, i)
+        for k, (result, heatmap) in enumerate(zip(some, heatmaps, strict=True), start=1):
+            if pictures is not None and (i % every == 0 or result.false_detection):
+                _draw(result, heatmap, pictures / f"{frame.name}_{k}.png")
+        results += some
+        watch("frames", i + 1, len(frames))
     return ScenesReport(settings, bundle, tuple(results))
 
 
 def measure_frame(
-    frame: BenchFrame,
-    bundle: Bundle,
-    settings: Settings,
-    count: int,
-    number_of_frame: int,
-    pictures: Path | None,
-) -> list[SceneResult]:
-    """One frame's scenes."""
+    frame: BenchFrame, bundle: Bundle, settings: Settings, count: int, number_of_frame: int
+) -> tuple[list[SceneResult], list[NDArray[np.float32]]]:
+    """One frame's scenes, and the heatmap of each."""
     demonstration = frame.read()
     height, width = demonstration.shape[:2]
     center = settings.center_px or (width / 2, height / 2)
@@ -164,14 +164,16 @@ def measure_frame(
     result = train(prepare(demonstration, bundle, settings), settings, probe=False)
     tuned = result.tuned_object(frame.name)
     found = [tuned.locate(scene.frame) for scene in scenes]
-    if pictures is not None:
-        for i, (scene, (detection, heatmap)) in enumerate(zip(scenes, found, strict=True), 1):
-            picture = draw_detection(scene.frame, heatmap, detection, _title(frame, scene))
-            write_png(pictures / f"{frame.name}_{i}.png", picture)
-    return [
+    results = [
         SceneResult(frame, scene, detection)
         for scene, (detection, _) in zip(scenes, found, strict=True)
     ]
+    return results, [heatmap for _, heatmap in found]
+
+
+def _draw(result: SceneResult, heatmap: NDArray[np.float32], path: Path) -> None:
+    title = _title(result.frame, result.scene)
+    write_png(path, draw_detection(result.scene.frame, heatmap, result.detection, title))
 
 
 def _title(frame: BenchFrame, scene: Scene) -> str:

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.angles import wrap_half_turn
-from qsgm.train.noise import Colour, blur, white_noise
-from qsgm.train.parts import Brush
-from qsgm.train.render import Light, Sprite, fitted, render
-from qsgm.train.shapes import ELONGATED
-from qsgm.train.tables import draw_table
+from qsgm.train.drawing.noise import Colour, blur, white_noise
+from qsgm.train.drawing.parts import Brush
+from qsgm.train.drawing.render import Light, Sprite, fitted, render
+from qsgm.train.drawing.shapes import ELONGATED
+from qsgm.train.drawing.tables import draw_table
 
 FRAME_HW = (480, 640)
 CENTER_PX = (320, 240)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from qsgm.angles import wrap_half_turn
 from qsgm.errors import QsgmError
-from qsgm.train.noise import Colour, Field, blur, chance, smooth_noise
-from qsgm.train.parts import Brush
-from qsgm.train.render import Light, Sprite, fitted, render
-from qsgm.train.shapes import COMPACT, ELONGATED
-from qsgm.train.tables import TABLE_KINDS, draw_table
+from qsgm.train.drawing.noise import Colour, Field, blur, chance, smooth_noise
+from qsgm.train.drawing.parts import Brush
+from qsgm.train.drawing.render import Light, Sprite, fitted, render
+from qsgm.train.drawing.shapes import COMPACT, ELONGATED
+from qsgm.train.drawing.tables import TABLE_KINDS, draw_table
 
 __all__ = ["OBJECT_KINDS", "TABLE_KINDS", "DrawnFrame", "draw_frame"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.train.noise import (
+from qsgm.train.drawing.noise import (
     Colour,
     Field,
     Shape,

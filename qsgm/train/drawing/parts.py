@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.train.noise import Colour, chance, hsv, mixed
+from qsgm.train.drawing.noise import Colour, chance, hsv, mixed
 
 Outline = NDArray[np.float64]
 

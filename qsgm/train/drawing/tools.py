@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from qsgm.train.noise import chance
-from qsgm.train.parts import (
+from qsgm.train.drawing.noise import chance
+from qsgm.train.drawing.parts import (
     Brush,
     Builder,
     Part,

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.train.noise import Colour, Field, blur, chance, hsv, smooth_noise, white_noise
-from qsgm.train.parts import Outline, Part, Shape
+from qsgm.train.drawing.noise import Colour, Field, blur, chance, hsv, smooth_noise, white_noise
+from qsgm.train.drawing.parts import Outline, Part, Shape
 
 SUPERSAMPLING = 3
 _MARGIN_PX = 3

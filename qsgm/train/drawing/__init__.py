@@ -1,0 +1,1 @@
+"""How objects and tables are drawn: random fields, parts, shading, families of shapes."""
