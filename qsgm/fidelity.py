@@ -52,7 +52,9 @@ def compare_probe(outputs: Mapping[str, Array], layers: Sequence[int]) -> dict[i
     """One probe's outputs (`int8{k}`, `float{k}`, `true{k}`, `clipped{k}`), layer by layer."""
     return {
         k: compare(
-            outputs[f"int8{k}"], outputs[f"float{k}"], outputs[f"true{k}"],
+            outputs[f"int8{k}"],
+            outputs[f"float{k}"],
+            outputs[f"true{k}"],
             float(outputs[f"clipped{k}"]),
         )
         for k in layers

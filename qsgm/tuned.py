@@ -13,7 +13,7 @@ from qsgm.angles import AngleEncoding
 from qsgm.bundle import NETWORK, read_manifest
 from qsgm.errors import QsgmError
 from qsgm.files import new_folder
-from qsgm.predict import Detection, locate
+from qsgm.predict import Detection, locate, refine
 from qsgm.runtime import open_session
 
 FORMAT = "qsgm-object"
@@ -44,15 +44,17 @@ class TunedObject:
         return heatmap
 
     def locate(self, frame: NDArray[np.uint8]) -> tuple[Detection, NDArray[np.float32]]:
-        """Where the object is in a frame (H, W, 3), and the heatmap that says so."""
+        """Where the object is in a frame (H, W, 3), and the heatmap that says so.
+
+        The heatmap finds it, a second and closer look says where exactly and how far turned.
+        """
         heatmap = self.heatmap(frame)
         height, width = frame.shape[:2]
-        return (
-            locate(
-                heatmap, (height, width), self.description.offset_rad, self.description.encoding
-            ),
-            heatmap,
-        )
+        how = self.description.offset_rad, self.description.encoding
+        coarse = locate(heatmap, (height, width), *how)
+        if not coarse.found:
+            return coarse, heatmap
+        return refine(coarse, frame, self.heatmap, *how), heatmap
 
 
 def save_object(
@@ -79,9 +81,7 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     manifest = read_manifest(folder, FORMAT, VERSION, "qsgm finetune -o DIR")
     path = folder / NETWORK
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != manifest["sha256"]:
-        raise QsgmError(
-            f"{path} is missing or altered; tune the object again with `qsgm finetune`"
-        )
+        raise QsgmError(f"{path} is missing or altered; tune the object again with `qsgm finetune`")
     description = ObjectDescription(
         str(manifest["name"]), manifest["encoding"], float(manifest["offset_rad"])
     )

@@ -10,7 +10,7 @@ first step to long after the last.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, pi
+from math import cos, log, pi
 from typing import Any
 
 import torch
@@ -29,15 +29,17 @@ MOMENTUM = 0.9
 class MamlConfig:
     """Sizes and rates of the third stage."""
 
-    outer_steps: int = 3000
-    tasks_per_step: int = 8
+    outer_steps: int = 2000
+    tasks_per_step: int = 6
     unroll: int = 16
     runs_per_task_slot: int = 4  # runs kept going, per task of an outer step
     restart: float = 0.04
     longest_run: int = 800
     sgm_rate: float = 1e-3
     start_rate: float = 5e-5
-    log_rate_rate: float = 5e-3
+    log_rate_rate: float = 1e-3
+    # Looking ahead a few steps only, meta-training would raise the rates without end.
+    largest_rate_change: float = 3.0
     matching_weight: tuple[float, float] = (1.0, 0.3)  # at the start and at the end
     largest_gradient: float = 1.0
     warm_up: int = 50
@@ -77,6 +79,7 @@ class MetaTraining:
         self.config, self.loss, self.tasks, self.sgms = config, loss, tasks, dict(sgms)
         self.start = [tuple(nn.Parameter(t.clone()) for t in layer) for layer in start]
         self.log_rates = nn.Parameter(torch.tensor(rates).log())
+        self.first_log_rates = self.log_rates.detach().clone()
         self.generator = torch.Generator().manual_seed(seed)
         count = config.tasks_per_step * config.runs_per_task_slot
         self.runs = [self._fresh() for _ in range(count)]
@@ -151,7 +154,14 @@ class MetaTraining:
         size = nn.utils.clip_grad_norm_(parameters, self.config.largest_gradient)
         if torch.isfinite(size):  # a run that blew up teaches nothing; it is restarted below
             self.optimizer.step()
+            self._bound_rates()
         self.schedule.step()
+
+    @torch.no_grad()
+    def _bound_rates(self) -> None:
+        reach = log(self.config.largest_rate_change)
+        low, high = self.first_log_rates - reach, self.first_log_rates + reach
+        self.log_rates.copy_(self.log_rates.clamp(low, high))
 
     def _keep(self, chosen: list[Run], states: list[LayerState], query: Tensor) -> None:
         """Store where each run has got to; restart those that are old, lost or unlucky."""

@@ -37,7 +37,7 @@ from qsgm.train.tasks import TaskSet, draw_tasks, start_states
 TUNED = 3
 # Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
 # for its SGM to know what they do (design findings 5 and 7).
-FIRST_RATES = (5e-3, 1e-3, 3e-3)
+FIRST_RATES = (8e-3, 1e-3, 3e-3)
 RATE_GRID = (3e-3, 1e-2, 3e-2, 1e-1)
 # Meta-training's rates are constant, the device's decay: they may start higher.
 META_RATE_FACTORS = (1.0, 1.5, 2.0, 3.0)
@@ -154,7 +154,7 @@ def _match(
             sgm.load_state_dict(partial.data["sgms"][layer])
         return {layer: sgm.eval() for layer, sgm in sgms.items()}
     # Layers 5 and 6 hold still here: what layer 4's SGM regresses is then a function of its input.
-    rates = (2 * FIRST_RATES[0], 0.0, 0.0)
+    rates = (FIRST_RATES[0], 0.0, 0.0)
     start = folded_start(net, TUNED)
     examples = record_examples(tasks, start, rates, loss, config.matching, seed)
     done, total = 0, len(sgms) * config.matching.fit_steps
