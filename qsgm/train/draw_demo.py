@@ -50,7 +50,7 @@ _DEMONSTRATION = _View(CENTER_PX, 0.35, (0, 0), Light(-0.5, -0.4, 0.77), (1.0, 1
 _SCENE = _View((207, 301), 1.40, (150, 90), Light(0.55, -0.3, 0.78), (0.8, 0.9, 0.97), -0.2)
 
 
-def draw_demo(seed: int, object_kind: str = "bottle", table_kind: str = "planks") -> Demo:
+def draw_demo(seed: int, object_kind: str = "handle_tool", table_kind: str = "planks") -> Demo:
     """Draw both pictures; the same numbers give the same pictures."""
     table = draw_table(np.random.default_rng([seed, 0]), table_kind, (600, 800))
     brush = Brush(np.random.default_rng([seed, 1]), _mean_colour(table))
