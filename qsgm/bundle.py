@@ -19,6 +19,14 @@ MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
 VERSION = 1
 NETWORK = "network.onnx"
+MANIFEST_KEYS: dict[str, type] = {
+    "encoding": str,
+    "label_smoothing": float,
+    "most_layers": int,
+    "files": dict,
+    "initializers": dict,
+    "recipes": dict,
+}
 
 Method = Literal["sgm", "bp"]
 Precision = Literal["int8", "float"]
@@ -127,18 +135,35 @@ def load_bundle(folder: Path) -> Bundle:
         QsgmError: a file is missing or altered, or this is no bundle.
     """
     manifest = read_manifest(folder, FORMAT, VERSION, "qsgm fold-and-quantize")
+    require_keys(folder / MANIFEST, manifest, MANIFEST_KEYS, "qsgm fold-and-quantize")
     for name, expected in manifest["files"].items():
         path = folder / name
         if not path.is_file():
             raise QsgmError(
                 f"the bundle {folder} lacks {name}; export it again with `qsgm fold-and-quantize`"
             )
-        if hashlib.sha256(path.read_bytes()).hexdigest() != expected["sha256"]:
+        wanted = expected.get("sha256") if isinstance(expected, dict) else None
+        if hashlib.sha256(path.read_bytes()).hexdigest() != wanted:
             raise QsgmError(
                 f"{path} is not the file the manifest describes (its sha256 differs); "
                 "export the bundle again with `qsgm fold-and-quantize`"
             )
     return Bundle(folder, manifest)
+
+
+def require_keys(path: Path, manifest: dict[str, Any], keys: dict[str, type], command: str) -> None:
+    """Refuse a description that lacks a key, or has a value of another type under it.
+
+    Raises:
+        QsgmError: names the first such key.
+    """
+    for key, kind in keys.items():
+        value = manifest.get(key)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            got = "nothing" if key not in manifest else type(value).__name__
+            raise QsgmError(
+                f"{path}: {key!r} holds {got}, expected {kind.__name__}; make it with `{command}`"
+            )
 
 
 def read_manifest(folder: Path, kind: str, version: int, command: str) -> dict[str, Any]:

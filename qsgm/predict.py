@@ -125,13 +125,15 @@ def _fine_grid(
     """Answers (3, n) of windows 4 px apart around a detection, and their centres x, y (n,)."""
     shifts = range(0, CELL_PX, FINE_PX)
     corner = [
-        min(max(round(center) - FINE_REACH_PX - HALF_CROP_PX, 0), size - FINE_SIDE_PX)
+        max(min(round(center) - FINE_REACH_PX - HALF_CROP_PX, size - FINE_SIDE_PX), 0)
         for center, size in zip(coarse.center_px, frame.shape[1::-1], strict=True)
     ]
     answers, xs, ys = [], [], []
     for down, right in product(shifts, shifts):
-        left, top = max(corner[0], 0) + right, max(corner[1], 0) + down
+        left, top = corner[0] + right, corner[1] + down
         part = frame[top : top + FINE_SIDE_PX - CELL_PX, left : left + FINE_SIDE_PX - CELL_PX]
+        if min(part.shape[:2]) < CROP_PX:  # a frame hardly larger than a window
+            continue
         heatmap = heatmap_of(np.ascontiguousarray(part))
         rows, cols = np.mgrid[: heatmap.shape[1], : heatmap.shape[2]]
         answers.append(heatmap.reshape(3, -1))

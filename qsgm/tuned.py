@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.angles import AngleEncoding
-from qsgm.bundle import NETWORK, read_manifest
+from qsgm.bundle import NETWORK, read_manifest, require_keys
 from qsgm.errors import QsgmError
 from qsgm.files import new_folder
 from qsgm.predict import Detection, locate, refine
@@ -20,6 +20,8 @@ FORMAT = "qsgm-object"
 VERSION = 1
 DESCRIPTION = "object.json"
 REPORT = "report.json"
+_COMMAND = "qsgm finetune -o DIR"
+_KEYS: dict[str, type] = {"name": str, "encoding": str, "offset_rad": float, "sha256": str}
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     Raises:
         QsgmError: it is missing, altered, or something else.
     """
-    manifest = read_manifest(folder, FORMAT, VERSION, "qsgm finetune -o DIR")
+    manifest = read_manifest(folder, FORMAT, VERSION, _COMMAND)
+    require_keys(folder / DESCRIPTION, manifest, _KEYS, _COMMAND)
     path = folder / NETWORK
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != manifest["sha256"]:
         raise QsgmError(f"{path} is missing or altered; tune the object again with `qsgm finetune`")

@@ -109,3 +109,24 @@ def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> No
     path.write_text(json.dumps(manifest))
     with pytest.raises(QsgmError, match=r"cannot load .*trunk_3\.onnx"):
         load_bundle(own_bundle).session(trunk_file(3))
+
+
+@pytest.mark.parametrize("key", ["encoding", "files", "initializers", "recipes", "most_layers"])
+def test_a_manifest_without_one_of_its_keys_is_refused_by_that_key(
+    own_bundle: Path, key: str
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for broken in ({k: v for k, v in manifest.items() if k != key}, manifest | {key: None}):
+        path.write_text(json.dumps(broken))
+        with pytest.raises(QsgmError, match=f"'{key}' holds"):
+            load_bundle(own_bundle)
+
+
+def test_a_file_entry_of_another_shape_is_refused(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["files"]["network.onnx"] = "fine"
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(QsgmError, match="its sha256 differs"):
+        load_bundle(own_bundle)

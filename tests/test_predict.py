@@ -1,6 +1,8 @@
-"""Heatmaps made up from a known place and angle: `locate` must give both back."""
+"""Answers made up from a known place and angle: `locate` and `refine` must give both back."""
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +12,11 @@ from numpy.typing import NDArray
 
 from qsgm.angles import AngleEncoding, angle_error, encode_angle
 from qsgm.errors import QsgmError
-from qsgm.predict import locate
+from qsgm.predict import Detection, locate, refine
 
 FRAME_HW = (480, 640)
 ROWS_COLS = (23, 33)
+ABSENT = Detection(False, 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
 
 
 def response(
@@ -177,3 +180,65 @@ def test_a_heatmap_that_is_not_finite_is_refused(bad: float) -> None:
 def test_a_heatmap_of_another_shape_is_a_programming_error(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="must be"):
         locate(np.zeros(shape, dtype=np.float32), FRAME_HW, 0.0)
+
+
+def frame_of_places(height: int, width: int) -> NDArray[np.uint8]:
+    """A frame that says at every pixel where that pixel is."""
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x & 255, (x >> 8) | ((y >> 8) << 4), y & 255], axis=-1).astype(np.uint8)
+
+
+def answers_at(
+    x: float, y: float, angle_rad: float, skew: float = 0.0
+) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:
+    """A network that sees an object at (x, y), and its angle wrong by `skew` rad per px off."""
+
+    def heatmap_of(part: NDArray[np.uint8]) -> NDArray[np.float32]:
+        corner = part[: part.shape[0] - 127 : 16, : part.shape[1] - 127 : 16].astype(int)
+        window_x = corner[..., 0] + 256 * (corner[..., 1] & 15) + 64
+        window_y = corner[..., 2] + 256 * (corner[..., 1] >> 4) + 64
+        off = np.hypot(window_x - x, window_y - y)
+        quality = 1 / (1 + np.exp((off - 18) / 2))
+        angle = angle_rad + skew * off
+        return np.stack([quality, np.sin(2 * angle), np.cos(2 * angle)]).astype(np.float32)
+
+    return heatmap_of
+
+
+@given(
+    x=st.floats(100, 540),
+    y=st.floats(100, 380),
+    angle=st.floats(-1.5, 1.5),
+    off=st.tuples(st.floats(-8, 8), st.floats(-8, 8)),
+)
+def test_a_second_look_finds_the_centre_to_a_pixel_from_anywhere_near_it(
+    x: float, y: float, angle: float, off: tuple[float, float]
+) -> None:
+    coarse = replace(ABSENT, found=True, center_px=(x + off[0], y + off[1]))
+    detection = refine(coarse, frame_of_places(480, 640), answers_at(x, y, angle), 0.25)
+    assert math.dist(detection.center_px, (x, y)) < 1.0
+    assert detection.displacement_px == pytest.approx(
+        (detection.center_px[0] - 320, detection.center_px[1] - 240)
+    )
+    turned = math.radians(detection.angle_deg) + 0.25
+    assert angle_error(np.array(turned), np.array(angle)) < 1e-3
+
+
+def test_a_second_look_takes_the_angle_from_windows_at_the_centre() -> None:
+    coarse = replace(ABSENT, found=True, center_px=(300.0, 200.0))
+    network = answers_at(305.0, 203.0, 0.5, skew=0.02)
+    detection = refine(coarse, frame_of_places(480, 640), network, 0.0)
+    everywhere = locate(network(frame_of_places(480, 640)), FRAME_HW, 0.0)
+    wrong = abs(math.radians(detection.angle_deg) - 0.5)
+    assert wrong < 0.12
+    assert wrong < abs(math.radians(everywhere.angle_deg) - 0.5) / 2
+
+
+@pytest.mark.parametrize(("height", "width"), [(128, 128), (140, 200), (192, 192)])
+def test_a_second_look_works_in_a_frame_hardly_larger_than_a_window(
+    height: int, width: int
+) -> None:
+    coarse = replace(ABSENT, found=True, center_px=(64.0, 64.0))
+    detection = refine(coarse, frame_of_places(height, width), answers_at(64, 64, 0.5), 0.0)
+    assert math.dist(detection.center_px, (64, 64)) < 24
+    assert detection.angle_deg == pytest.approx(math.degrees(0.5), abs=1e-3)

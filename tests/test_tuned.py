@@ -79,3 +79,14 @@ def test_another_description_is_refused(saved: Path, content: str) -> None:
 
 def test_a_folder_that_is_no_object_is_refused(tmp_path: Path) -> None:
     assert "holds no object.json" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["name", "encoding", "offset_rad", "sha256"])
+def test_a_description_without_one_of_its_keys_is_refused_by_that_key(
+    saved: Path, key: str
+) -> None:
+    path = saved / "object.json"
+    description = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in description.items() if k != key}))
+    with pytest.raises(QsgmError, match=f"'{key}' holds nothing"):
+        load_object(saved)
