@@ -156,9 +156,10 @@ def test_the_report_has_its_keys(workplace: Workplace, report: ExportReport) -> 
     for layer in values["layers"].values():
         assert set(layer) >= FIDELITY | {"range", "bytes"}
     assert values["fold_max_abs_error"] < 1e-4
-    # (19*8+8) + (8*6+6) + (6*16+16) numbers; in int8 10 numbers per channel come on top.
+    # (19*8+8) + (8*6+6) + (6*16+16) numbers; in int8 each weight is two bytes, and
+    # every row has a bias and two scales, every input an offset and a gain.
     assert values["bytes"]["float"] == 2 * 4 * (160 + 54 + 112)
-    assert values["bytes"]["int8"] == 2 * (152 + 48 + 96 + 8 * (8 + 6 + 16) + 8 * 19)
+    assert values["bytes"]["int8"] == 2 * (2 * (152 + 48 + 96) + 12 * (8 + 6 + 16) + 8 * 19)
     sizes = [(workplace.folder / "first" / name).stat().st_size for name in GRAPHS]
     assert values["bundle_bytes"] == sum(sizes)
 
@@ -242,8 +243,8 @@ def test_folding_that_changes_outputs_is_refused(workplace: Workplace) -> None:
 def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> None:
     model = onnx.load(bundle.folder / "step_sgm_int8_sgd_3.onnx")
     refuse_float_products("step", model)
-    # ONNX Runtime has no integer product with a factor on its sum.
-    gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][2]
+    # ONNX Runtime has no integer product with a factor on its sum and a bias.
+    gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][3]
     gemm.attribute.append(onnx.helper.make_attribute("alpha", 2.0))
-    with pytest.raises(QsgmError, match=r"step: .* computes 2 of the 3 int8 products of layer5"):
+    with pytest.raises(QsgmError, match=r"step: .* computes 5 of the 6 int8 products of layer5"):
         refuse_float_products("step", model)

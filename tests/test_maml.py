@@ -113,11 +113,19 @@ def test_a_run_that_blew_up_starts_afresh_and_teaches_nothing() -> None:
 
 
 def test_runs_end_at_their_longest_age() -> None:
-    training = tiny_training(replace(CONFIG, longest_run=6))
+    training = tiny_training(replace(CONFIG, longest_run=(6, 6)))
     training.outer_step()
     assert {run.age for run in training.runs} == {3}
     training.outer_step()
     assert {run.age for run in training.runs} == {0}
+
+
+def test_runs_may_grow_longer_until_half_way() -> None:
+    training = tiny_training(replace(CONFIG, longest_run=(100, 800), outer_steps=10))
+    lengths = []
+    for training.step in (0, 2, 5, 9):
+        lengths.append(training._longest_run())
+    assert lengths == [100, 380, 800, 800]
 
 
 def test_a_resumed_training_goes_on_with_the_same_parameters_and_schedule() -> None:

@@ -44,7 +44,8 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
     assert {n: len(rates) for n, rates in checkpoint.rates.items()} == {1: 1, 2: 2, 3: 3}
     assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3"
     assert list(dict.fromkeys(stages)) == ["backbone", "tasks", "matching", "meta", "rates"]
-    assert [path.name for path in tmp_path.iterdir()] == ["sgm.pt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
+    assert checkpoint.card["command"] in (tmp_path / "sgm.md").read_text()
 
 
 def test_the_same_seed_gives_the_same_checkpoint_and_another_seed_another(tmp_path: Path) -> None:

@@ -303,7 +303,7 @@ def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
     data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(BATCH)
     int8_sgms = quantized(net, tuned, data, sgms)
     model = step_model(net, tuned, int8_sgms, Loss(), Sgd())
-    assert integer_operators(model) == ["QGemm"] * len(sgms[4].convs) * (tuned - 1)
+    assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
     exported = Exported(model, net, data)
     reference = Reference(net, tuned, Loss(), Sgd())
     reference.local_step(*picked(data, rows), int8_sgms)
@@ -319,7 +319,7 @@ def test_the_probe_gives_true_float_and_int8_gradients(
     data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(20)
     int8_sgms = quantized(net, tuned, data, sgms)
     model = probe_model(net, tuned, sgms, int8_sgms, Loss())
-    assert integer_operators(model) == ["QGemm"] * len(sgms[4].convs) * (tuned - 1)
+    assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
     got = Exported(model, net, data).step(rows)
 
     reference = Reference(net, tuned, Loss(), Sgd())

@@ -19,7 +19,7 @@ from qsgm.train.tasks import CropStream
 class BackboneConfig:
     """Sizes and rates of the first stage."""
 
-    steps: int = 2000
+    steps: int = 1800
     frames_per_batch: int = 8
     crops_per_frame: int = 24
     peak_rate: float = 4e-3

@@ -36,7 +36,8 @@ class LayerReport:
         """Of its constants, scales included."""
         arrays: list[NDArray[Any]] = [self.int8_sgm.input_low, self.int8_sgm.input_gain]
         for product in self.int8_sgm.products:
-            arrays += [product.weight, product.scale, product.bias]
+            arrays += [product.weight, product.fine, product.bias]
+            arrays += [product.scale, product.fine_scale]
         return sum(array.nbytes for array in arrays)
 
     @property
@@ -169,9 +170,10 @@ How the checkpoint was pretrained, and what it scored:
 
 ## The int8 SGMs
 
-u8 activations, s8 weights, a scale for every channel (calibrator: {MinMax.name}), float gradients
-out. Measured while the int8 SGMs fine-tuned the last three layers on the calibration frames;
-range and scale are those of the activation channels.
+u8 activations, weights of two s8 planes (one holds what rounding to the other left), a scale for
+every channel (calibrator: {MinMax.name}), float gradients out. Measured while the int8 SGMs
+fine-tuned the last three layers on the calibration frames; range and scale are those of the
+activation channels.
 
 {lines}
 """

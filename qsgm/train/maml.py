@@ -29,12 +29,12 @@ MOMENTUM = 0.9
 class MamlConfig:
     """Sizes and rates of the third stage."""
 
-    outer_steps: int = 2000
+    outer_steps: int = 1200
     tasks_per_step: int = 6
     unroll: int = 16
     runs_per_task_slot: int = 4  # runs kept going, per task of an outer step
     restart: float = 0.04
-    longest_run: int = 800
+    longest_run: tuple[int, int] = (100, 800)  # at the start, and from half-way on
     sgm_rate: float = 1e-3
     start_rate: float = 5e-5
     log_rate_rate: float = 1e-3
@@ -171,7 +171,7 @@ class MetaTraining:
             run.age += self.config.unroll
             sound = all(torch.isfinite(state.weight).all() for state in run.states)
             if not (lucky[i] and sound and torch.isfinite(query[i])) or (
-                run.age >= self.config.longest_run
+                run.age >= self._longest_run()
             ):
                 self.runs[self.runs.index(run)] = self._fresh()
 
@@ -185,6 +185,11 @@ class MetaTraining:
         """Linear warm-up, then a cosine down to a twentieth."""
         warm = min(1.0, (step + 1) / self.config.warm_up)
         return warm * (0.525 + 0.475 * cos(pi * step / self.config.outer_steps))
+
+    def _longest_run(self) -> float:
+        """Long runs come later: SGMs that have learnt little lead them astray."""
+        first, last = self.config.longest_run
+        return first + (last - first) * min(1.0, 2 * self.step / self.config.outer_steps)
 
     def _matching_weight(self) -> float:
         first, last = self.config.matching_weight

@@ -1,4 +1,4 @@
-"""Static SGMs in int8: unsigned activations, signed weights, int32 biases, float gradient out.
+"""Static SGMs in int8: u8 activations, weights of two s8 planes, int32 biases, float gradient out.
 
 Every channel has a scale of its own, and none of them costs anything at run time:
 
@@ -8,6 +8,8 @@ Every channel has a scale of its own, and none of them costs anything at run tim
    row of the product before it and multiplies its column of the product behind it.
 3. All u8 tensors are then left with scale 1 and zero point 0, an int32 bias has exactly its
    weight row's scale, and the gradient needs no scale at all: it leaves the last product as float.
+4. Folded-in scales spread a row's weights so far apart that one s8 plane would cost more than all
+   activations' rounding together. A second plane holds what the first one rounded away.
 
 Case 1 is exact for 1x1 kernels only: a padded kernel needs x = 0 at the border, while a u8 zero
 means x = low. Larger kernels are refused.
@@ -24,6 +26,9 @@ from qsgm.train.fold import FloatArray, FoldedSgm
 
 U8_MAX = 255
 S8_MAX = 127
+# How many steps of the fine plane make one of the coarse plane. Rounding leaves half a step at
+# most, so the fine plane never holds more than 127: nothing clips.
+FINE_STEPS = 2 * S8_MAX
 # Half of int32; the other half is the products' and more than they can fill.
 BIAS_LIMIT = 2**30
 # Below this a product with the scale may become subnormal, which some CPUs flush to zero.
@@ -45,11 +50,22 @@ class SgmRanges:
 
 @dataclass(frozen=True)
 class QuantizedProduct:
-    """u8 (N, I) -> float (N, O): (x @ weight.T + bias) * scale, the sum in int32."""
+    """u8 (N, I) -> float (N, O): (x @ weight.T + bias) * scale + (x @ fine.T) * fine_scale.
 
-    weight: NDArray[np.int8]  # (O, I)
+    Both sums are in int32. Together the planes give a weight 16 bits, sign included, while each
+    takes part in a u8 x s8 product. The bias can do with the coarse scale: what rounding costs
+    it, once per row, is far less than what rounding costs the row's inputs.
+    """
+
+    weight: NDArray[np.int8]  # (O, I), coarse
+    fine: NDArray[np.int8]  # (O, I), what rounding to the coarse plane left
     scale: FloatArray  # (O,)
     bias: NDArray[np.int32]  # (O,)
+
+    @property
+    def fine_scale(self) -> FloatArray:
+        """What one step of the fine plane stands for, (O,)."""
+        return self.scale / np.float32(FINE_STEPS)
 
 
 @dataclass(frozen=True)
@@ -137,7 +153,7 @@ def live_span(span: Float64Array) -> tuple[Float64Array, tuple[int, ...]]:
 
 
 def quantize_product(weight: Float64Array, bias: Float64Array) -> QuantizedProduct:
-    """Round weight (O, I) to s8 with one symmetric scale per row, and the bias to int32.
+    """Round weight (O, I) to two s8 planes with one symmetric scale per row, the bias to int32.
 
     A bias far larger than its row would overflow: such a row gets a coarser scale. Its weights
     lose precision that the bias drowns anyway.
@@ -145,8 +161,11 @@ def quantize_product(weight: Float64Array, bias: Float64Array) -> QuantizedProdu
     scale = np.maximum(np.abs(weight).max(axis=1) / S8_MAX, np.abs(bias) / BIAS_LIMIT)
     scale = np.maximum(scale, SMALLEST_SCALE).astype(np.float32)
     exact = scale.astype(np.float64)
-    rounded = np.rint(weight / exact[:, None]).astype(np.int8)
-    return QuantizedProduct(rounded, scale, np.rint(bias / exact).astype(np.int32))
+    steps = weight / exact[:, None]
+    coarse = np.rint(steps)
+    fine = np.rint((steps - coarse) * FINE_STEPS)
+    rounded_bias = np.rint(bias / exact).astype(np.int32)
+    return QuantizedProduct(coarse.astype(np.int8), fine.astype(np.int8), scale, rounded_bias)
 
 
 def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, float]:
@@ -182,6 +201,12 @@ def to_u8(x: FloatArray) -> NDArray[np.uint8]:
 
 
 def integer_product(product: QuantizedProduct, x: NDArray[np.uint8]) -> FloatArray:
-    """u8 (N, I) to float32 (N, O): exact in int32, then one float32 product with the scale."""
-    total = x.astype(np.int32) @ product.weight.T.astype(np.int32) + product.bias
-    return total.astype(np.float32) * product.scale
+    """u8 (N, I) to float32 (N, O): each plane's sum exact in int32, rounded from there on.
+
+    That is four times in float32: both sums, their products with the scales, added.
+    """
+    wide = x.astype(np.int32)
+    coarse = wide @ product.weight.T.astype(np.int32) + product.bias
+    fine = wide @ product.fine.T.astype(np.int32)
+    scaled = coarse.astype(np.float32) * product.scale
+    return scaled + fine.astype(np.float32) * product.fine_scale

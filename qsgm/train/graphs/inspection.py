@@ -5,7 +5,7 @@ A wrong pattern runs all the same, in float and slowly: look before shipping.
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import onnx
@@ -13,6 +13,7 @@ import onnxruntime as ort
 
 from qsgm.errors import QsgmError
 
+PRODUCTS = frozenset({"Gemm", "MatMul", "Conv"})
 INTEGER_OPERATORS = frozenset({"QGemm", "QLinearConv", "QLinearMatMul", "MatMulIntegerToFloat"})
 
 
@@ -36,9 +37,9 @@ def refuse_float_products(name: str, model: onnx.ModelProto) -> None:
 
     `name` is the graph's, for the message.
     """
-    rounded = by_layer(model.graph.node, {"QuantizeLinear"})
+    written = by_layer(products_of_rounded(model.graph.node), PRODUCTS)
     integer = by_layer(optimized_nodes(model), INTEGER_OPERATORS)
-    for layer, expected in sorted(rounded.items()):
+    for layer, expected in sorted(written.items()):
         if integer[layer] != expected:
             raise QsgmError(
                 f"{name}: ONNX Runtime {ort.__version__} computes {integer[layer]} of the"
@@ -46,6 +47,12 @@ def refuse_float_products(name: str, model: onnx.ModelProto) -> None:
             )
 
 
-def by_layer(nodes: Iterable[onnx.NodeProto], op_types: frozenset[str] | set[str]) -> Counter[str]:
+def products_of_rounded(nodes: Sequence[onnx.NodeProto]) -> list[onnx.NodeProto]:
+    """The products whose first factor was rounded."""
+    rounded = {node.output[0] for node in nodes if node.op_type == "DequantizeLinear"}
+    return [node for node in nodes if node.op_type in PRODUCTS and node.input[0] in rounded]
+
+
+def by_layer(nodes: Iterable[onnx.NodeProto], op_types: frozenset[str]) -> Counter[str]:
     """How many nodes of these types each layer has: the first part of a node's name."""
     return Counter(node.name.partition("/")[0] for node in nodes if node.op_type in op_types)

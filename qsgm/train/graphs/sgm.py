@@ -5,9 +5,10 @@ layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.train.fold import FoldedConv, FoldedSgm
+from qsgm.train.fold import FloatArray, FoldedConv, FoldedSgm
 from qsgm.train.graphs.build import Ops, Value
 from qsgm.train.graphs.layers import Batch
 from qsgm.train.quantize import CLIP_TOLERANCE_STEPS, U8_MAX, QuantizedProduct, QuantizedSgm
@@ -51,10 +52,13 @@ def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
 
 
 def int8_sgm(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:
-    """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale."""
-    x = int8_product(op, sgm.products[0], as_u8(op, scaled))
-    for product in sgm.products[1:]:
-        x = int8_product(op, product, as_u8(op, op.Relu(x)))
+    """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale.
+
+    ReLU costs no node: rounding to u8 clips at zero.
+    """
+    x = scaled
+    for product in sgm.products:
+        x = int8_product(op, product, as_u8(op, x))
     return x
 
 
@@ -65,17 +69,22 @@ def as_u8(op: Ops, x: Value) -> Value:
 
 
 def int8_product(op: Ops, product: QuantizedProduct, x: Value) -> Value:
-    """x (B, I) to (B, O). The bias has the weight's scale, exactly: the input's scale is 1."""
-    scale = op.constant(product.scale)
-    no_offset = op.constant(np.zeros_like(product.weight[:, 0]), np.int8)
-    weight = op.constant(product.weight, np.int8)
-    bias = op.constant(product.bias, np.int32)
-    return op.Gemm(
-        x,
-        op.DequantizeLinear(weight, scale, no_offset, axis=0),
-        op.DequantizeLinear(bias, scale, axis=0),
-        transB=1,
-    )
+    """x (B, I) to (B, O), both planes added as float.
+
+    The bias has the coarse plane's scale, exactly: the input's scale is 1.
+    """
+    bias, scale = op.constant(product.bias, np.int32), op.constant(product.scale)
+    bias = op.DequantizeLinear(bias, scale, axis=0)
+    coarse = op.Gemm(x, s8_plane(op, product.weight, product.scale), bias, transB=1)
+    fine = op.Gemm(x, s8_plane(op, product.fine, product.fine_scale), transB=1)
+    return op.Add(coarse, fine)
+
+
+def s8_plane(op: Ops, plane: NDArray[np.int8], scale: FloatArray) -> Value:
+    """Weights (O, I) with a scale per row, as the runtime wants to see them."""
+    no_offset = op.constant(np.zeros_like(plane[:, 0]), np.int8)
+    weight = op.constant(plane, np.int8)
+    return op.DequantizeLinear(weight, op.constant(scale), no_offset, axis=0)
 
 
 def clipped_fraction(op: Ops, scaled: Value) -> Value:
