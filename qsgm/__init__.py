@@ -8,11 +8,32 @@ result.save(Path("mug"), name="mug")
 detection, heatmap = load_object(Path("mug")).locate(read_frame(Path("scene.png")))
 """
 
-from qsgm.bundle import load_bundle
+import importlib
+from typing import TYPE_CHECKING
+
 from qsgm.errors import QsgmError
-from qsgm.finetune import Settings, finetune
-from qsgm.images import read_frame
-from qsgm.tuned import load_object
+
+if TYPE_CHECKING:
+    from qsgm.bundle import load_bundle
+    from qsgm.finetuning import Settings, finetune
+    from qsgm.images import read_frame
+    from qsgm.tuned import load_object
+else:
+    # Imported when asked for, since they bring in ONNX Runtime and OpenCV. None of these modules
+    # may have the name of an export: importing it would put the module in the export's place.
+    _HOME = {
+        "Settings": "qsgm.finetuning",
+        "finetune": "qsgm.finetuning",
+        "load_bundle": "qsgm.bundle",
+        "load_object": "qsgm.tuned",
+        "read_frame": "qsgm.images",
+    }
+
+    def __getattr__(name: str) -> object:
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_HOME[name]), name)
+
 
 __version__ = "0.1.0"
 __all__ = [

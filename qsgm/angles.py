@@ -5,12 +5,13 @@ The double angle (sin 2θ, cos 2θ) has no seam anywhere; the paper's (sin θ, c
 θ in (-π/2, π/2] breaks at ±90° (design finding 2) and is kept for the paper's tables.
 """
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 AngleEncoding = Literal["double", "paper"]
+ENCODINGS: tuple[AngleEncoding, ...] = get_args(AngleEncoding)
 Floats = NDArray[np.float32] | NDArray[np.float64]
 
 
@@ -40,6 +41,12 @@ def decode_angle(
 def angle_error(predicted_rad: Floats, true_rad: Floats) -> NDArray[np.float64]:
     """Absolute difference of line directions [rad], in [0, π/2]."""
     return np.abs(wrap_half_turn(np.asarray(predicted_rad) - np.asarray(true_rad)))
+
+
+def round_degrees(angle_deg: float, digits: int) -> float:
+    """An angle in (-90, 90] rounded so that it stays there: what would be -90 is 90."""
+    rounded = round(angle_deg, digits) + 0.0  # adding 0.0 turns -0.0 into 0.0
+    return 90.0 if rounded <= -90.0 else rounded
 
 
 def mean_direction(angle_rad: Floats) -> tuple[float, float]:

@@ -2,15 +2,18 @@
 
 import hashlib
 import json
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from qsgm.angles import AngleEncoding
+from qsgm.angles import ENCODINGS, AngleEncoding
+from qsgm.defaults import MOST_LAYERS
 from qsgm.errors import QsgmError
 from qsgm.runtime import open_session
 
@@ -19,6 +22,8 @@ MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
 VERSION = 1
 NETWORK = "network.onnx"
+FLOAT_BYTES = 4
+COMMAND = "qsgm fold-and-quantize"
 MANIFEST_KEYS: dict[str, type] = {
     "encoding": str,
     "label_smoothing": float,
@@ -30,7 +35,9 @@ MANIFEST_KEYS: dict[str, type] = {
 
 Method = Literal["sgm", "bp"]
 Precision = Literal["int8", "float"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 OptimizerName = Literal["sgd", "adam"]
+OPTIMIZERS: tuple[OptimizerName, ...] = get_args(OptimizerName)
 
 
 def trunk_file(tuned: int) -> str:
@@ -91,7 +98,7 @@ class Bundle:
 
     def recipe(self, method: Method, tuned: int, optimizer: OptimizerName | None) -> Recipe:
         """The rates found for a method, with its own optimizer or the one asked for."""
-        recipes = self.manifest["recipes"]["bp" if tuned == 1 else method]
+        recipes = self.manifest["recipes"][method]
         name: OptimizerName = optimizer or recipes["optimizer"]
         return Recipe(name, tuple(recipes["rates"][name][str(tuned)]))
 
@@ -134,8 +141,8 @@ def load_bundle(folder: Path) -> Bundle:
     Raises:
         QsgmError: a file is missing or altered, or this is no bundle.
     """
-    manifest = read_manifest(folder, FORMAT, VERSION, "qsgm fold-and-quantize")
-    require_keys(folder / MANIFEST, manifest, MANIFEST_KEYS, "qsgm fold-and-quantize")
+    manifest = read_manifest(folder, FORMAT, VERSION, COMMAND)
+    _check_manifest(folder / MANIFEST, manifest)
     for name, expected in manifest["files"].items():
         path = folder / name
         if not path.is_file():
@@ -151,7 +158,85 @@ def load_bundle(folder: Path) -> Bundle:
     return Bundle(folder, manifest)
 
 
-def require_keys(path: Path, manifest: dict[str, Any], keys: dict[str, type], command: str) -> None:
+def needed_files(most_layers: int) -> set[str]:
+    """The graphs without which a bundle cannot do what its number of layers promises."""
+    needed = {NETWORK}
+    for tuned in range(1, most_layers + 1):
+        needed |= {trunk_file(tuned), head_file(tuned)}
+        for optimizer in OPTIMIZERS:
+            needed |= {step_file("bp", "float", optimizer, tuned)}
+            needed |= {step_file("sgm", precision, optimizer, tuned) for precision in PRECISIONS}
+    return needed
+
+
+def _check_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
+    """Refuse a manifest that does not say everything that is needed, or says nonsense.
+
+    Raises:
+        QsgmError: names the first key that is wrong.
+    """
+    require_keys(path, manifest, MANIFEST_KEYS, COMMAND)
+    for key, (expected, is_sane) in _EXPECTED.items():
+        try:
+            sane = is_sane(manifest)
+        except (KeyError, TypeError, AttributeError, OSError):
+            sane = False
+        if not sane:
+            raise QsgmError(f"{path}: {key!r} is damaged: expected {expected}; run `{COMMAND}`")
+    missing = sorted(needed_files(manifest["most_layers"]) - manifest["files"].keys())
+    if missing:
+        raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
+    _check_places(path, manifest["initializers"], manifest["most_layers"])
+
+
+def _check_places(path: Path, places: Mapping[str, Any], most_layers: int) -> None:
+    """Refuse weights and biases that do not lie inside the network's file."""
+    network = path.with_name(NETWORK)
+    size = network.stat().st_size if network.is_file() else math.inf  # missing: refused later
+    for layer in tuned_layers(most_layers):
+        for name, sides in ((f"weight{layer}", 4), (f"bias{layer}", 1)):
+            if not _is_place(places.get(name), sides, size):
+                raise QsgmError(
+                    f"{path}: 'initializers' gives {str(places.get(name))[:80]} for {name}, "
+                    f"expected an offset and {sides} sides inside {NETWORK}; run `{COMMAND}` again"
+                )
+
+
+def _is_place(place: Any, sides: int, size: float) -> bool:
+    if not isinstance(place, dict) or not isinstance(place.get("shape"), list):
+        return False
+    offset, shape = place.get("offset"), place["shape"]
+    if not isinstance(offset, int) or not all(type(side) is int and side > 0 for side in shape):
+        return False
+    return len(shape) == sides and 0 <= offset <= size - FLOAT_BYTES * math.prod(shape)
+
+
+def _are_recipes(manifest: Mapping[str, Any]) -> bool:
+    """Whether every method has an optimizer, and rates for it and for any number of layers."""
+    for method in get_args(Method):
+        recipe = manifest["recipes"][method]
+        if recipe["optimizer"] not in OPTIMIZERS:
+            return False
+        for optimizer in OPTIMIZERS:
+            for tuned in range(1, manifest["most_layers"] + 1):
+                rates = recipe["rates"][optimizer][str(tuned)]
+                if len(rates) != tuned or not all(0 < rate < math.inf for rate in rates):
+                    return False
+    return True
+
+
+# key: (what is expected, whether the manifest has it); in this order
+_EXPECTED: dict[str, tuple[str, Callable[[Mapping[str, Any]], bool]]] = {
+    "encoding": (" or ".join(ENCODINGS), lambda found: found["encoding"] in ENCODINGS),
+    "label_smoothing": ("0 to below 1", lambda found: 0 <= found["label_smoothing"] < 1),
+    "most_layers": (f"1 to {MOST_LAYERS}", lambda found: 1 <= found["most_layers"] <= MOST_LAYERS),
+    "recipes": ("positive rates, one per tuned layer, for every method", _are_recipes),
+}
+
+
+def require_keys(
+    path: Path, manifest: Mapping[str, Any], keys: Mapping[str, type], command: str
+) -> None:
     """Refuse a description that lacks a key, or has a value of another type under it.
 
     Raises:
@@ -185,7 +270,7 @@ def read_manifest(folder: Path, kind: str, version: int, command: str) -> dict[s
         raise QsgmError(
             f"{folder} holds no {path.name}; expected a folder written by `{command}`"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, nested without end
         raise QsgmError(f"{path} is not JSON; make it again with `{command}`") from error
     got = (manifest.get("format"), manifest.get("version")) if isinstance(manifest, dict) else None
     if got != (kind, version):

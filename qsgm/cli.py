@@ -23,17 +23,19 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from qsgm import __version__, paths
+from qsgm import __version__, defaults, paths
 from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
-    from qsgm.finetune import FinetuneResult, Settings
+    from qsgm.finetuning import FinetuneResult, Settings
 
 EXIT_BAD_INPUT = 1
 EXIT_INTERRUPTED = 130
+LARGEST_HIDDEN = 1024
 # UsageError; typer keeps it in another place in every other version.
 USAGE_ERROR = cast(type[Exception], typer.BadParameter.__base__)
+LARGEST_SEED = 2**31 - 1  # what numpy and torch take both
 HOST_LIBRARIES = ("torch", "onnx", "onnxscript")
 
 # (stage, done, of how many, values to show)
@@ -52,6 +54,13 @@ class OptimizerChoice(StrEnum):
 
     SGD = "sgd"
     ADAM = "adam"
+
+
+class Encoding(StrEnum):
+    """What the two angle channels stand for."""
+
+    DOUBLE = "double"
+    PAPER = "paper"
 
 
 class Device(StrEnum):
@@ -83,12 +92,16 @@ PrecisionOption = Annotated[
     typer.Option("--int8/--float", help="Precision of the SGMs.", show_default="int8"),
 ]
 MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
-LayersOption = Annotated[int, typer.Option(min=1, max=3, help="How many of the last to tune.")]
+LayersOption = Annotated[
+    int, typer.Option(min=1, max=defaults.MOST_LAYERS, help="How many of the last to tune.")
+]
 OptimizerOption = Annotated[
     OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
 ]
 EpochsOption = Annotated[int, typer.Option(min=0, max=10_000, help="Passes over 800 crops.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="Of everything drawn at random.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=LARGEST_SEED, help="Of everything drawn at random.")
+]
 CenterOption = Annotated[
     str | None,
     typer.Option(metavar="X,Y", help="Object's centre in px; default: the frame's centre."),
@@ -126,12 +139,24 @@ def pretrain(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE")] = Path("sgm.pt"),
     seed: SeedOption = 0,
     device: Annotated[Device, typer.Option(help="For the backbone.")] = Device.CPU,
+    encoding: Annotated[
+        Encoding, typer.Option(help="Of the angle: the paper's breaks at 90 degrees.")
+    ] = Encoding.DOUBLE,
+    hidden: Annotated[
+        str | None,
+        typer.Option(metavar="N,N", help="Channels of the SGMs' hidden layers, such as 64,64."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Pretrain network and SGMs on drawn objects (host; needs torch)."""
+    """Pretrain network and SGMs on drawn objects (host; needs torch).
+
+    What was interrupted goes on where it stopped when the same command runs again.
+    """
+    chosen = {} if hidden is None else {"hidden": _channels(hidden)}
     host = _host_module("qsgm.train.pretrain")
+    config, loss = host.PretrainConfig(**chosen), host.Loss(encoding=encoding.value)
     with _progress() as watch:
-        host.pretrain(output, seed, device.value, watch)
+        host.pretrain(output, seed, device.value, watch, config=config, loss=loss)
     if as_json:
         _print_json({"output": str(output), "seed": seed, "device": device.value})
     else:
@@ -141,19 +166,20 @@ def pretrain(
 @app.command("draw-calibration")
 def draw_calibration(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("calib"),
-    count: Annotated[int | None, typer.Option(min=1, max=10_000, help="Frames.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of everything drawn at random.")] = None,
+    count: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Frames.")
+    ] = defaults.CALIBRATION_FRAMES,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw a calibration set and the demo's two pictures (host)."""
     host = _host_module("qsgm.train.draw_calibration")
     with _progress() as watch:
-        host.draw_calibration_set(
-            output,
-            host.DEFAULT_COUNT if count is None else count,
-            host.DEFAULT_SEED if seed is None else seed,
-            watch,
-        )
-    typer.echo(f"calibration set: {output}")
+        host.draw_calibration_set(output, count, seed, watch)
+    if as_json:
+        _print_json({"output": str(output), "frames": count, "seed": seed})
+    else:
+        typer.echo(f"calibration set: {output}")
 
 
 @app.command("fold-and-quantize")
@@ -179,9 +205,9 @@ def finetune(
     frame: FrameArgument,
     int8: PrecisionOption = None,
     method: MethodOption = MethodName.SGM,
-    layers: LayersOption = 3,
+    layers: LayersOption = defaults.LAYERS,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = 20,
+    epochs: EpochsOption = defaults.EPOCHS,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
@@ -245,9 +271,11 @@ def predict(
 def fidelity(
     frame: FrameArgument,
     int8: PrecisionOption = None,
-    layers: Annotated[int, typer.Option(min=2, max=3, help="The last one has no SGM.")] = 3,
+    layers: Annotated[
+        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
+    ] = defaults.LAYERS,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = 20,
+    epochs: EpochsOption = defaults.EPOCHS,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
@@ -268,8 +296,8 @@ def fidelity(
 @bench.command("accuracy")
 def bench_accuracy(
     frames: FramesOption = None,
-    layers: LayersOption = 3,
-    epochs: EpochsOption = 20,
+    layers: LayersOption = defaults.LAYERS,
+    epochs: EpochsOption = defaults.EPOCHS,
     limit: LimitOption = None,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
@@ -281,7 +309,7 @@ def bench_accuracy(
     """Untouched, SGM in int8 and float, backpropagation: on the same crops of every frame."""
     from qsgm.bench.accuracy import measure_accuracy
     from qsgm.bench.frames import list_frames
-    from qsgm.finetune import Settings
+    from qsgm.finetuning import Settings
 
     some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
@@ -297,9 +325,9 @@ def bench_scenes(
     scenes: Annotated[int, typer.Option(min=1, max=1000, help="With the object, per frame.")] = 3,
     int8: PrecisionOption = None,
     method: MethodOption = MethodName.SGM,
-    layers: LayersOption = 3,
+    layers: LayersOption = defaults.LAYERS,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = 20,
+    epochs: EpochsOption = defaults.EPOCHS,
     limit: LimitOption = None,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
@@ -323,8 +351,10 @@ def bench_scenes(
 @bench.command("speed")
 def bench_speed(
     frames: FramesOption = None,
-    layers: LayersOption = 3,
-    epochs: EpochsOption = 20,
+    layers: LayersOption = defaults.LAYERS,
+    epochs: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Passes over 800 crops.")
+    ] = defaults.EPOCHS,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of every variant.")] = 5,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
@@ -335,7 +365,7 @@ def bench_speed(
     """Seconds per stage on the first frame, next to the same job in torch if it is installed."""
     from qsgm.bench.frames import list_frames
     from qsgm.bench.speed import measure_speed, render
-    from qsgm.finetune import Settings
+    from qsgm.finetuning import Settings
 
     frame = list_frames(paths.calibration_folder() if frames is None else frames, 1)[0].path
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
@@ -417,7 +447,7 @@ def _settings(
     center: str | None,
     threads: int,
 ) -> "Settings":
-    from qsgm.finetune import Settings
+    from qsgm.finetuning import Settings
 
     if method is MethodName.BP and int8:
         _complain("note: backpropagation runs in float; --int8 concerns SGMs only")
@@ -431,6 +461,19 @@ def _settings(
         center_px=_center(center),
         threads=threads,
     )
+
+
+def _channels(text: str) -> tuple[int, ...]:
+    try:
+        channels = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        channels = ()
+    if not channels or not all(1 <= count <= LARGEST_HIDDEN for count in channels):
+        raise typer.BadParameter(
+            f"{text!r} gives no channels: expected numbers of 1 to {LARGEST_HIDDEN}, such as 64,64",
+            param_hint="'--hidden'",
+        )
+    return channels
 
 
 def _center(text: str | None) -> tuple[float, float] | None:
@@ -447,7 +490,7 @@ def _center(text: str | None) -> tuple[float, float] | None:
 
 
 def _finetune(frame: Path, bundle: "Bundle", settings: "Settings") -> "FinetuneResult":
-    from qsgm.finetune import finetune as run_finetune
+    from qsgm.finetuning import finetune as run_finetune
     from qsgm.images import read_demonstration
 
     demonstration = read_demonstration(frame)
@@ -475,7 +518,7 @@ def _host_module(name: str) -> Any:
             raise
         raise QsgmError(
             f"this command runs on the host and needs {missing}, which is not installed: "
-            f"install with pip install 'qsgm[train]'"
+            f"pip install -c constraints.txt '.[train]' in a checkout"
         ) from error
 
 

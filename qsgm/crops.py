@@ -27,6 +27,8 @@ POSITIVE_JITTER_PX = 4.0
 # Closer than this, a window is neither clearly centred nor clearly not: never a negative.
 NEGATIVE_DISTANCE_PX = 28.0
 NEAR_MISS_DISTANCE_PX = 64.0
+# At least this share of the frame's windows has to be as far as that from the object.
+LEAST_NEGATIVE_SHARE = 0.05
 
 _LUMA_BGR = np.array([0.114, 0.587, 0.299])
 
@@ -64,9 +66,11 @@ def plan_crops(
         count: number of crops.
 
     Raises:
-        QsgmError: the window around the centre does not lie inside the frame.
+        QsgmError: the window around the centre does not lie inside the frame, or the frame has no
+            room for windows beside it.
     """
     _check_center(frame_hw, center_px)
+    _check_room(frame_hw, center_px)
     quality = rng.permutation(np.arange(count) % 2).astype(np.float32)
     jitter = rng.uniform(-POSITIVE_JITTER_PX, POSITIVE_JITTER_PX, (count, 2))
     centers = np.where(
@@ -124,6 +128,20 @@ def _check_center(frame_hw: tuple[int, int], center_px: tuple[float, float]) -> 
         raise QsgmError(
             f"the object's centre ({x:g}, {y:g}) is closer than {HALF_CROP_PX} px to the border "
             f"of the {width}x{height} frame; move the camera or pass another --center"
+        )
+
+
+def _check_room(frame_hw: tuple[int, int], center_px: tuple[float, float]) -> None:
+    """Negatives are drawn until they are far enough from the object: they have to exist."""
+    height, width = frame_hw
+    x = np.linspace(HALF_CROP_PX, width - HALF_CROP_PX, 33) - center_px[0]
+    y = np.linspace(HALF_CROP_PX, height - HALF_CROP_PX, 33) - center_px[1]
+    far = np.hypot(x[:, None], y) >= NEGATIVE_DISTANCE_PX
+    if far.mean() < LEAST_NEGATIVE_SHARE:
+        raise QsgmError(
+            f"the {width}x{height} frame has no room for windows {NEGATIVE_DISTANCE_PX:g} px and "
+            f"more from the object: expected about 640x480 (at least {2 * CROP_PX} px on each "
+            f"side); take a larger frame"
         )
 
 

@@ -54,8 +54,8 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
 
     Args:
         path: the folder to make. It may be absent, empty, or an earlier output of this kind.
-        marker: name of the file that every folder of this kind holds, such as ``object.json``.
-            The block has to write it.
+        marker: name of a file that every folder of this kind holds and no other kind does, such as
+            ``object.json``. The block has to write it.
 
     Yields:
         An empty folder on the same disk.
@@ -67,11 +67,10 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
     temporary = _beside(path.resolve(), "partial")
     try:
         temporary.mkdir(parents=True)
-    except OSError as error:
-        raise _cannot_write(path, error) from error
-    try:
         yield temporary
         replace_folder(temporary, path, marker)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
     finally:
         _remove_quietly(temporary)
 
@@ -114,29 +113,36 @@ def check_replaceable(path: Path, marker: str) -> None:
             return
         if not path.is_dir():
             raise QsgmError(f"cannot write {path}: expected a folder or a new name, got a file")
-        entries = _entries(path)
+        listed = {LISTING, *_listed(path)}
+        foreign = next((name for name in _entries(path) if name not in listed), None)
+        empty = next(_entries(path), None) is None
     except OSError as error:
         raise _cannot_write(path, error) from error
-    foreign = sorted(entries - _listed(path) - {LISTING})
-    if foreign:
+    if foreign is not None:
         raise QsgmError(
-            f"will not replace the folder {path}: qsgm did not write {foreign[0]!r} in it; "
+            f"will not replace the folder {path}: qsgm did not write {foreign!r} in it; "
             f"pass a new or an empty folder"
         )
-    if entries and not (path / marker).is_file():
+    if not empty and not (path / marker).is_file():
         raise QsgmError(
             f"will not replace the folder {path}: it holds another kind of output (no {marker}); "
             f"pass a new or an empty folder"
         )
 
 
-def _entries(folder: Path) -> set[str]:
-    """Relative names of everything below a folder that is not itself a plain folder."""
-    return {
-        item.relative_to(folder).as_posix()
-        for item in folder.rglob("*")
-        if item.is_symlink() or not item.is_dir()
-    }
+def _entries(folder: Path) -> Iterator[str]:
+    """Relative names of everything below a folder that is not itself a plain folder.
+
+    Those right in it come first, and no folder is looked into before its turn: whoever stops at
+    the first name does not walk a whole disk.
+    """
+    waiting = [folder]
+    for place in waiting:
+        for item in sorted(place.iterdir()):
+            if item.is_dir() and not item.is_symlink():
+                waiting.append(item)
+            else:
+                yield item.relative_to(folder).as_posix()
 
 
 def _listed(folder: Path) -> set[str]:
@@ -152,13 +158,15 @@ def _write_listing(folder: Path) -> None:
     """Write the listing in the format of ``sha256sum``, so that ``sha256sum -c`` checks it."""
     lines = [
         f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n"
-        for name in sorted(_entries(folder) - {LISTING})
+        for name in sorted({*_entries(folder)} - {LISTING})
     ]
     (folder / LISTING).write_text("".join(lines), encoding="utf-8")
 
 
 def _beside(path: Path, kind: str) -> Path:
     """An unused hidden name in the same folder, hence on the same disk."""
+    if not path.name:
+        raise QsgmError(f"cannot write {path}: it has no name of its own; pass a place below it")
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{kind}")
 
 

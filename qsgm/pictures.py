@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.angles import round_degrees
 from qsgm.crops import CROP_PX, HALF_CROP_PX
 from qsgm.predict import CELL_PX, Detection
 
@@ -218,7 +219,7 @@ def _values(detection: Detection) -> list[tuple[str, str]]:
         return [("best guess at", f"{x:.0f}, {y:.0f} px"), ("move", "-"), ("turn", "-"), quality]
     # Adding 0.0 turns a rounded -0.0 into 0.0.
     right, down = (round(value, 1) + 0.0 for value in detection.displacement_px)
-    turn = round(detection.angle_deg, 1) + 0.0
+    turn = round_degrees(detection.angle_deg, 1)
     return [
         ("centre (x, y)", f"{x:.1f}, {y:.1f} px"),
         ("move (right, down)", f"{right:+.1f}, {down:+.1f} px"),

@@ -15,11 +15,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from qsgm.angles import round_degrees
 from qsgm.fidelity import LayerFidelity
 from qsgm.predict import Detection
 
 if TYPE_CHECKING:
-    from qsgm.finetune import Accuracy, FinetuneResult
+    from qsgm.finetuning import Accuracy, FinetuneResult
 
 FIDELITY_LEGEND = (
     "means over the run; cos: cosine of int8, float and true gradients; norm ratio: |int8|/|true|; "
@@ -48,6 +49,11 @@ def number(value: float, digits: int) -> float | None:
     return round(float(value), digits) + 0.0 if math.isfinite(value) else None
 
 
+def angle(value_deg: float, digits: int) -> float | None:
+    """A rounded angle in (-90, 90], None unless it is finite."""
+    return round_degrees(value_deg, digits) if math.isfinite(value_deg) else None
+
+
 def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str, Any]:
     """The stable keys of `qsgm finetune`, then the others."""
     settings = result.settings
@@ -67,7 +73,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "peak_activation_bytes": result.peak_activation_bytes,
         "optimizer": result.recipe.optimizer,
         "rates": list(result.recipe.rates),
-        "orientation_deg": number(math.degrees(result.prepared.offset_rad), 2),
+        "orientation_deg": angle(math.degrees(result.prepared.offset_rad), 2),
         "orientation_strength": number(result.prepared.offset_strength, 3),
         "warnings": list(result.warnings),
     }
@@ -98,7 +104,7 @@ def predict_json(
         "quality": number(detection.quality, 4),
         "center_px": [number(value, 2) for value in detection.center_px],
         "displacement_px": [number(value, 2) for value in detection.displacement_px],
-        "angle_deg": number(detection.angle_deg, 2),
+        "angle_deg": angle(detection.angle_deg, 2),
         "heatmap_shape": [int(side) for side in heatmap_shape],
         "found": detection.found,
         "output": None if output is None else str(output),
@@ -167,7 +173,7 @@ def fidelity_table(fidelity: Mapping[int, LayerFidelity]) -> Table:
     table = plain_table("how faithful the gradients were")
     table.add_column("\nlayer", justify="right")
     for _, header, _ in _FIDELITY_COLUMNS:
-        table.add_column(header, justify="right")
+        table.add_column(Text(header), justify="right")
     for layer, values in sorted(fidelity.items()):
         cells = [form.format(getattr(values, key)) for key, _, form in _FIDELITY_COLUMNS]
         table.add_row(str(layer), *cells)
@@ -188,19 +194,20 @@ def detection_table(detection: Detection, name: str) -> RenderableType:
     table.add_column()
     x, y = detection.center_px
     if not detection.found:
-        table.add_row(name, Text("not found", style="bold red"))
+        table.add_row(Text(name), Text("not found", style="bold red"))
         table.add_row("quality", f"{detection.quality:.2f} (found from 0.50)")
         table.add_row("best guess", f"{x:.0f}, {y:.0f} px")
         return table
     right, down = (value + 0.0 for value in detection.displacement_px)
-    table.add_row(name, Text("found", style="bold green"))
+    table.add_row(Text(name), Text("found", style="bold green"))
     table.add_row("quality", f"{detection.quality:.2f}")
     table.add_row("centre", f"{x:.1f}, {y:.1f} px")
     table.add_row("move", f"{right:+.1f} px right, {down:+.1f} px down")
-    table.add_row("turn", f"{detection.angle_deg:+.1f}° counter-clockwise")
+    table.add_row("turn", f"{round_degrees(detection.angle_deg, 1):+.1f}° counter-clockwise")
     return table
 
 
 def plain_table(title: str | None) -> Table:
     """A table without vertical lines, its title on the left."""
-    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    shown = None if title is None else Text(title)  # a name may look like markup: [x]
+    return Table(title=shown, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)

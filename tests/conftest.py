@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 from numpy.typing import NDArray
 from torch import nn
 
@@ -28,6 +29,9 @@ from qsgm.train.sgm import Sgm
 
 # Threads that wait for each other on a busy machine take longer than this work does.
 torch.set_num_threads(1)
+# The same examples every time, however busy the machine is, and nothing kept between runs.
+settings.register_profile("qsgm", deadline=None, derandomize=True, database=None)
+settings.load_profile("qsgm")
 
 MOST_LAYERS = 3
 RATES = (0.002, 0.005, 0.02)

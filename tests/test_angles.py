@@ -13,6 +13,7 @@ from qsgm.angles import (
     decode_angle,
     encode_angle,
     mean_direction,
+    round_degrees,
     wrap_half_turn,
 )
 
@@ -95,3 +96,11 @@ def test_the_mean_direction_is_the_best_of_all_directions(base: float, spread: l
 def test_lines_without_a_common_direction_have_no_strength() -> None:
     _, strength = mean_direction(np.radians([0.0, 60.0, 120.0]))
     assert strength == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rounded_degrees_stay_in_their_half_turn() -> None:
+    assert round_degrees(-89.998, 2) == 90.0
+    assert round_degrees(-89.994, 2) == -89.99
+    assert round_degrees(-89.96, 1) == 90.0
+    assert round_degrees(89.999, 2) == 90.0
+    assert math.copysign(1, round_degrees(-0.001, 2)) == 1

@@ -15,7 +15,7 @@ from qsgm.bench.scenes import ON_OBJECT_PX, SceneResult, ScenesReport
 from qsgm.bench.speed import measure_speed, ratios
 from qsgm.bench.staging import BORDER_PX, CutOut, Scene, cut_out, make_scenes, put_down
 from qsgm.bundle import Bundle
-from qsgm.finetune import Settings, finetune
+from qsgm.finetuning import Settings, finetune
 from qsgm.images import write_png
 from qsgm.predict import Detection
 
@@ -248,10 +248,20 @@ def test_speed_names_the_variant_that_failed(bundle: Bundle, tmp_path: Path) -> 
 def test_the_torch_job_learns_what_backpropagation_here_learns(
     frame_path: Path, bundle: Bundle
 ) -> None:
-    from qsgm.bench import torchjob
+    from qsgm.train import torchjob
 
     settings = Settings(method="bp", layers=2, epochs=2)
     own = finetune(BenchFrame(frame_path, None, None).read(), bundle, settings)
     other = torchjob.run(frame_path, bundle, 2, 2, 0, 1)
     assert other["detection_accuracy"] == pytest.approx(own.accuracy.detection_accuracy, abs=0.006)
     assert other["angle_mae_deg"] == pytest.approx(own.accuracy.angle_mae_deg, abs=0.1)
+
+
+def test_a_frame_that_cannot_serve_as_a_demonstration_is_refused(tmp_path: Path) -> None:
+    write_png(tmp_path / "small.png", np.random.default_rng(0).integers(0, 255, (200, 200, 3)))
+    write_png(tmp_path / "flat.png", np.full((480, 640, 3), 90, np.uint8))
+    flat, small = list_frames(tmp_path)
+    with pytest.raises(QsgmError, match="one flat colour"):
+        flat.read()
+    with pytest.raises(QsgmError, match="too small for a demonstration"):
+        small.read()

@@ -1,15 +1,28 @@
 """A bundle is used as it was exported, or refused in one line."""
 
+import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
+from numpy.typing import NDArray
 from onnx import numpy_helper
 
 from qsgm import QsgmError, load_bundle
-from qsgm.bundle import NETWORK, Bundle, step_file, trunk_file, tuned_layers
+from qsgm.bundle import (
+    NETWORK,
+    Bundle,
+    Recipe,
+    head_file,
+    probe_file,
+    step_file,
+    trunk_file,
+    tuned_layers,
+)
+from qsgm.finetuning import Settings, finetune
 
 
 def test_a_whole_bundle_loads(bundle: Bundle) -> None:
@@ -85,6 +98,7 @@ def test_a_graph_altered_by_one_bit_is_named(own_bundle: Path) -> None:
     [
         ("", "is not JSON"),
         ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
         ("[]", "is of format None"),
         ('{"format": "qsgm-object", "version": 1}', "is of format ('qsgm-object', 1)"),
         ('{"format": "qsgm-bundle", "version": 99}', "is of format ('qsgm-bundle', 99)"),
@@ -105,7 +119,8 @@ def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> No
     path = own_bundle / "manifest.json"
     manifest = json.loads(path.read_text())
     (own_bundle / trunk_file(3)).write_bytes(b"not a graph")
-    del manifest["files"][trunk_file(3)]
+    sha256 = hashlib.sha256(b"not a graph").hexdigest()
+    manifest["files"][trunk_file(3)] = {"sha256": sha256}
     path.write_text(json.dumps(manifest))
     with pytest.raises(QsgmError, match=r"cannot load .*trunk_3\.onnx"):
         load_bundle(own_bundle).session(trunk_file(3))
@@ -130,3 +145,94 @@ def test_a_file_entry_of_another_shape_is_refused(own_bundle: Path) -> None:
     path.write_text(json.dumps(manifest))
     with pytest.raises(QsgmError, match="its sha256 differs"):
         load_bundle(own_bundle)
+
+
+def test_a_manifest_that_is_not_utf_8_is_refused(own_bundle: Path) -> None:
+    (own_bundle / "manifest.json").write_bytes(b'{"format": "\xff"}')
+    assert "is not JSON" in refusal(own_bundle)
+
+
+def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
+    *way, last, value = keys_and_value
+    for key in way:
+        manifest = manifest[key]
+    manifest[last] = value
+
+
+@pytest.mark.parametrize(
+    ("way", "value", "said"),
+    [
+        (("encoding",), "triple", "'encoding' is damaged: expected double or paper"),
+        (("label_smoothing",), 1.0, "'label_smoothing' is damaged"),
+        (("label_smoothing",), float("nan"), "'label_smoothing' is damaged"),
+        (("most_layers",), 0, "'most_layers' is damaged: expected 1 to 3"),
+        (("most_layers",), 6, "'most_layers' is damaged"),
+        (("recipes",), {}, "'recipes' is damaged"),
+        (("recipes", "bp"), [], "'recipes' is damaged"),
+        (("recipes", "sgm", "optimizer"), "lion", "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "sgd", "3"), [0.1], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "adam", "1"), [0.0], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "adam", "1"), ["fast"], "'recipes' is damaged"),
+        (("recipes", "bp", "rates", "adam", "2"), [1e-3, float("inf")], "'recipes' is damaged"),
+        (("initializers", "bias6"), None, "'initializers' gives None for bias6"),
+        (("initializers", "bias6", "shape"), [3, 1], "'initializers' gives"),
+        (("initializers", "bias6", "shape"), ["3"], "'initializers' gives"),
+        (("initializers", "weight4", "offset"), 10**9, "'initializers' gives"),
+        (("initializers", "weight4", "offset"), -1, "'initializers' gives"),
+    ],
+)
+def test_a_manifest_that_says_nonsense_is_refused_by_its_key(
+    own_bundle: Path, way: tuple[str, ...], value: object, said: str
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    set_in(manifest, *way, value)
+    path.write_text(json.dumps(manifest))
+    assert said in refusal(own_bundle)
+
+
+@pytest.mark.parametrize(
+    "name", [NETWORK, head_file(1), trunk_file(3), step_file("sgm", "float", "adam", 2)]
+)
+def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
+    own_bundle: Path, name: str
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["files"][name]
+    path.write_text(json.dumps(manifest))
+    assert f"'files' does not list {name}" in refusal(own_bundle)
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        (trunk_file(3), trunk_file(1)),
+        (trunk_file(3), head_file(3)),
+        (head_file(3), head_file(1)),
+        (step_file("sgm", "int8", "sgd", 3), step_file("sgm", "int8", "sgd", 2)),
+        (step_file("sgm", "int8", "sgd", 3), trunk_file(3)),
+        (probe_file(3), head_file(3)),
+    ],
+)
+def test_another_graph_under_the_name_of_one_is_refused_when_it_runs(
+    own_bundle: Path, frame: NDArray[np.uint8], name: str, other: str
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    (own_bundle / name).write_bytes((own_bundle / other).read_bytes())
+    manifest["files"][name] = manifest["files"][other]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(QsgmError, match=r"does not fit .*; export it again with") as raised:
+        finetune(frame, load_bundle(own_bundle), Settings(epochs=1))
+    assert "\n" not in str(raised.value)
+
+
+def test_one_layer_is_tuned_with_the_rates_of_the_method_asked_for(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["1"] = [0.123]
+    path.write_text(json.dumps(manifest))
+    found = load_bundle(own_bundle)
+    assert found.recipe("sgm", 1, None) == Recipe("sgd", (0.123,))
+    assert found.recipe("bp", 1, None).optimizer == "adam"

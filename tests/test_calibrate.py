@@ -1,7 +1,7 @@
 """Ranges along whole runs: what the observers see is what the SGMs saw, frame after frame."""
 
+import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -11,7 +11,7 @@ import torch
 
 from qsgm import QsgmError
 from qsgm.files import check_replaceable
-from qsgm.images import read_frame
+from qsgm.images import read_frame, write_png
 from qsgm.train import calibrate as module
 from qsgm.train.calibrate import (
     CalibrationSet,
@@ -36,15 +36,6 @@ from qsgm.train.sgm import Sgm
 
 RATES = {1: (1e-3,), 2: (1e-3, 1e-3), 3: (1e-3, 1e-3, 1e-3)}
 EPOCHS = 1
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Threads that wait for each other on a busy machine take longer than this work does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)
@@ -223,6 +214,10 @@ def test_the_demo_object_turns_and_moves_as_its_truth_says() -> None:
         ("{", "is damaged"),
         ('{"frames": [{"file": "a"}]}', "is damaged"),
         ('{"frames": []}', "lists no frames"),
+        ("[" * 100_000, "is damaged"),
+        ('{"format": "qsgm-bundle", "frames": []}', "is damaged"),
+        ('{"version": 2, "frames": []}', "is damaged"),
+        ('{"format": "qsgm-calibration", "version": 1, "frames": []}', "lists no frames"),
     ],
 )
 def test_a_folder_that_is_no_calibration_set_is_refused(
@@ -232,6 +227,69 @@ def test_a_folder_that_is_no_calibration_set_is_refused(
         (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(QsgmError, match=message):
         CalibrationSet(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("file", "../frame.png"),
+        ("file", "/etc/passwd"),
+        ("file", "sub/frame.png"),
+        ("file", "sub\\frame.png"),
+        ("file", ".."),
+        ("file", ""),
+        ("file", "frame\0.png"),
+        ("file", "frame\n.png"),
+        ("file", "frame\ud800.png"),
+        ("file", 7),
+        ("sha256", None),
+        ("sha256", 7),
+        ("center_px", [320]),
+        ("center_px", [320, 240, 1]),
+        ("center_px", ["320", "240"]),
+        ("center_px", [320, float("nan")]),
+        ("center_px", [float("inf"), 240]),
+        ("center_px", [10**400, 240]),
+        ("center_px", [-1, 240]),
+        ("center_px", [True, 240]),
+        ("center_px", None),
+    ],
+)
+def test_an_entry_that_describes_no_frame_is_refused(
+    tmp_path: Path, key: str, value: object
+) -> None:
+    entry = {"file": "frame.png", "sha256": "0" * 64, "center_px": [320, 240]}
+    manifest = tmp_path / "manifest.json"
+    manifest.write_text(json.dumps({"frames": [entry]}))
+    assert len(CalibrationSet(tmp_path)) == 1
+    manifest.write_text(json.dumps({"frames": [entry | {key: value}]}))
+    with pytest.raises(QsgmError, match="is damaged") as caught:
+        CalibrationSet(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def write_set(folder: Path, picture: np.ndarray, center_px: tuple[float, float]) -> CalibrationSet:
+    """A set of one frame."""
+    write_png(folder / "frame.png", picture)
+    digest = hashlib.sha256((folder / "frame.png").read_bytes()).hexdigest()
+    entry = {"file": "frame.png", "sha256": digest, "center_px": center_px}
+    (folder / "manifest.json").write_text(json.dumps({"frames": [entry]}))
+    return CalibrationSet(folder)
+
+
+@pytest.mark.parametrize("center_px", [(640, 240), (320, 480), (1e9, 1e9)])
+def test_an_object_outside_its_frame_is_refused(
+    tmp_path: Path, frame: np.ndarray, center_px: tuple[float, float]
+) -> None:
+    assert write_set(tmp_path, frame, (639, 479))[0].center_px == (639, 479)
+    with pytest.raises(QsgmError, match=r"outside its frame of 640x480; correct its center_px"):
+        write_set(tmp_path, frame, center_px)[0]
+
+
+def test_a_frame_that_is_no_demonstration_is_refused(tmp_path: Path) -> None:
+    flat = np.full((480, 640, 3), 90, np.uint8)
+    with pytest.raises(QsgmError, match="one flat colour"):
+        write_set(tmp_path, flat, (320, 240))[0]
 
 
 def test_an_altered_frame_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from qsgm.errors import QsgmError
+from qsgm.train import checkpoint as module
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.sgm import Sgm
@@ -92,6 +94,11 @@ def test_someone_elses_checkpoint_is_refused(tmp_path: Path) -> None:
         ("hidden", {4: [7, 7], 5: [16]}),
         ("rates", "fast"),
         ("card", "{"),
+        ("card", "[" * 100_000),
+        ("net", {"layers.0.conv.weight": 1}),
+        ("sgms", [4, 5]),
+        ("sgms", {4.0: {}}),
+        ("version", torch.ones(2)),
         ("loss", {"nonsense": 1}),
     ],
 )
@@ -102,7 +109,104 @@ def test_a_checkpoint_with_a_wrong_part_is_refused(
     save_checkpoint(path, checkpoint)
     data = torch.load(path, weights_only=True)
     torch.save(data | {key: value}, path)
+    text = refuse(path)
+    assert "does not fit" in text or "no qsgm checkpoint" in text
+
+
+@pytest.mark.parametrize(
+    "widths",
+    [[0, 8], [-1], [8.0], [True], [1025], [10**12], [8] * 5, [8] * 10**6, [], 8, "88", None],
+)
+def test_hidden_widths_are_checked_before_anything_of_that_width_is_made(
+    tmp_path: Path, checkpoint: Checkpoint, widths: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "sgm.pt"
+    save_checkpoint(path, checkpoint)
+    data = torch.load(path, weights_only=True)
+    torch.save(data | {"hidden": {4: widths, 5: widths}}, path)
+    monkeypatch.setattr(module, "Sgm", lambda *_: pytest.fail("an SGM was made"))
+    assert "hidden width" in refuse(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("encoding", "triple"),
+        ("encoding", ["double"]),
+        ("label_smoothing", 1.0),
+        ("label_smoothing", -0.1),
+        ("label_smoothing", float("nan")),
+        ("label_smoothing", "0.1"),
+        ("angle_weight", 0.0),
+        ("angle_weight", float("inf")),
+        ("angle_weight", 10**400),
+        ("angle_weight", torch.ones(3)),
+        ("more\nlines", 1),
+    ],
+)
+def test_a_loss_that_cannot_be_is_refused(
+    tmp_path: Path, checkpoint: Checkpoint, field: str, value: Any
+) -> None:
+    path = tmp_path / "sgm.pt"
+    save_checkpoint(path, checkpoint)
+    data = torch.load(path, weights_only=True)
+    torch.save(data | {"loss": data["loss"] | {field: value}}, path)
     assert "does not fit" in refuse(path)
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [
+        {1: [0.1], 2: [0.1, 0.1]},
+        {1: [0.1], 2: [0.1, 0.1], 3: [0.1, 0.1]},
+        {1: [0.1], 2: [0.1, 0.1], 3: [0.1, 0.1, 0.0]},
+        {1: [-0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {1: [float("nan")], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {1: [float("inf")], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {1: [10**400], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {1: ["0.1"], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {0: [], 1: [0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {"1": [0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
+        {1: 0.1, 2: [0.1, 0.1], 3: [0.1] * 3},
+    ],
+)
+def test_rates_that_cannot_be_are_refused(
+    tmp_path: Path, checkpoint: Checkpoint, rates: Any
+) -> None:
+    path = tmp_path / "sgm.pt"
+    save_checkpoint(path, checkpoint)
+    torch.save(torch.load(path, weights_only=True) | {"rates": rates}, path)
+    assert "does not fit" in refuse(path)
+
+
+def test_a_small_file_that_unpacks_to_a_large_one_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "sgm.pt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("sgm/data.pkl", bytes(module.LARGEST_BYTES + 1))
+    assert path.stat().st_size < 2**20
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("it was read"))
+    assert "has 64 MB" in refuse(path)
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    assert "not a readable checkpoint" in refuse(tmp_path / ("x" * 5000))
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OverflowError("too large"), RecursionError()])
+def test_whatever_torch_raises_becomes_one_line(
+    tmp_path: Path, checkpoint: Checkpoint, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    save_checkpoint(tmp_path / "sgm.pt", checkpoint)
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "load", fail)
+        assert "not a readable checkpoint" in refuse(tmp_path / "sgm.pt")
+    monkeypatch.setattr(Sgm, "load_state_dict", fail)
+    assert (str(error) or type(error).__name__) in refuse(tmp_path / "sgm.pt")
 
 
 def test_weights_that_are_not_finite_are_refused_by_name(

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
-from qsgm import __version__, cli
+from qsgm import __version__, cli, finetuning
 from qsgm.bundle import NETWORK, trunk_file
 from qsgm.errors import QsgmError
+from qsgm.finetuning import Settings
 
 FINETUNE_KEYS = {
     "object",
@@ -300,6 +301,7 @@ USAGE_ERRORS = [
     ("--epochs", "many"),
     ("--seed", "abc"),
     ("--seed", "-1"),
+    ("--seed", "2147483648"),
     ("--center", "5"),
     ("--center", "5,x"),
     ("--center", "1,2,3"),
@@ -393,7 +395,9 @@ def test_host_commands_say_what_to_install_when_torch_is_missing(
 
     monkeypatch.setattr(cli, "importlib", SimpleNamespace(import_module=without_torch))
     for command in (("pretrain",), ("fold-and-quantize", "sgm.pt")):
-        assert_refused(qsgm(*command), 1, "needs torch", "pip install 'qsgm[train]'")
+        assert_refused(
+            qsgm(*command), 1, "needs torch", "pip install -c constraints.txt '.[train]'"
+        )
 
 
 def test_a_bug_is_not_hidden(qsgm: Run, monkeypatch: pytest.MonkeyPatch, frame_path: Path) -> None:
@@ -454,7 +458,7 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(
         raise KeyboardInterrupt
 
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(sys.modules["qsgm.finetune"], "tune", interrupted)
+    monkeypatch.setattr(finetuning, "tune", interrupted)
     outcome = qsgm("finetune", "--bundle", bundle_folder, "-o", tmp_path / "out", frame_path)
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "interrupted\n")
     assert sorted(tmp_path.rglob("*")) == before
@@ -492,3 +496,56 @@ def test_an_object_that_cannot_be_remembered_is_still_written(
     assert outcome.json["output"] == str(tmp_path / "bar")
     assert "will need --object" in outcome.err
     assert (tmp_path / "bar" / NETWORK).is_file()
+
+
+def test_speed_needs_a_step_to_time(qsgm: Run) -> None:
+    assert_refused(qsgm("bench", "speed", "--epochs", 0), 2, "--epochs")
+
+
+def test_drawing_a_calibration_set_prints_one_json_object(qsgm: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "calib"
+    outcome = qsgm("draw-calibration", "--count", 1, "--seed", 3, "-o", folder, "--json")
+    assert outcome.json == {"output": str(folder), "frames": 1, "seed": 3}
+    assert (folder / "frame_00.jpg").is_file()
+
+
+def test_pretrain_passes_on_encoding_and_hidden_channels(
+    qsgm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from qsgm.train import pretrain
+
+    given = []
+    monkeypatch.setattr(pretrain, "pretrain", lambda *_, **keywords: given.append(keywords))
+    common = ("pretrain", "--json", "-o", tmp_path / "sgm.pt")
+    assert qsgm(*common).json["output"] == str(tmp_path / "sgm.pt")
+    assert qsgm(*common, "--encoding", "paper", "--hidden", "16,8").code == 0
+    default, chosen = given
+    assert default["config"] == pretrain.PretrainConfig()
+    assert default["loss"].encoding == "double"
+    assert chosen["config"].hidden == (16, 8)
+    assert chosen["loss"].encoding == "paper"
+
+
+@pytest.mark.parametrize("hidden", ["", "a", "8,", "0", "-4,4", "8;8", "99999"])
+def test_hidden_channels_that_are_none_are_a_usage_error(qsgm: Run, hidden: str) -> None:
+    assert_refused(qsgm("pretrain", "--hidden", hidden), 2, "--hidden")
+
+
+def test_defaults_of_the_command_line_are_those_of_the_library(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def stop(_: Path, __: object, settings: object) -> None:
+        seen.append(settings)
+        raise QsgmError("enough")
+
+    monkeypatch.setattr(cli, "_finetune", stop)
+    qsgm("finetune", "--bundle", bundle_folder, frame_path)
+    assert seen == [Settings()]
+
+
+def test_an_overlay_without_a_name_is_refused(qsgm: Run, taught: Path, frame_path: Path) -> None:
+    for output in ("/", "."):
+        outcome = qsgm("predict", "--object", taught, "-o", output, frame_path)
+        assert_refused(outcome, 1, "cannot write")

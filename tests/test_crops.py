@@ -181,3 +181,20 @@ def test_crops_are_128_px_uint8() -> None:
     crops = cut_crops(noise_frame(), plan(count=3))
     assert crops.shape == (3, CROP_PX, CROP_PX, 3)
     assert crops.dtype == np.uint8
+
+
+@pytest.mark.parametrize("frame_hw", [(128, 128), (168, 168), (130, 170)])
+def test_a_frame_without_room_for_negatives_is_refused_instead_of_drawn_from_forever(
+    frame_hw: tuple[int, int],
+) -> None:
+    center = frame_hw[1] / 2, frame_hw[0] / 2
+    with pytest.raises(QsgmError, match="no room for windows 28 px and more from the object"):
+        plan_crops(frame_hw, center, np.random.default_rng(0), 4)
+
+
+def test_the_smallest_demonstration_has_room_for_negatives() -> None:
+    for center in ((128, 128), (64, 64)):
+        whole = plan_crops((256, 256), center, np.random.default_rng(0), 200)
+        negatives = whole.center_px[whole.quality == 0]
+        distance = np.linalg.norm(negatives - center, axis=1)
+        assert distance.min() >= NEGATIVE_DISTANCE_PX - 1e-3

@@ -3,10 +3,13 @@
 The linter sees direct imports only; a fresh interpreter sees what really gets loaded.
 """
 
+import ast
 import json
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import qsgm
 
@@ -61,3 +64,32 @@ def test_no_device_module_imports_a_host_library() -> None:
 def test_the_probe_sees_an_import_that_is_not_direct() -> None:
     # qsgm.predict reaches OpenCV only through qsgm.crops.
     assert brought_in(["qsgm.predict"], ("cv2",)) == {"qsgm.predict": ["cv2"]}
+
+
+def test_no_device_module_imports_a_host_library_even_inside_a_function() -> None:
+    top = Path(qsgm.__file__).parent
+    found = []
+    for file in top.rglob("*.py"):
+        if "train" in file.relative_to(top).parts:
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            found += [(file.name, n) for n in names if n.partition(".")[0] in HOST_ONLY]
+    assert found == []
+
+
+def test_the_command_line_starts_without_onnx_runtime_and_opencv() -> None:
+    assert brought_in(["qsgm.cli"], ("onnxruntime", "cv2", "numpy")) == {"qsgm.cli": []}
+
+
+def test_every_export_is_what_it_says_even_after_its_module_was_imported() -> None:
+    import qsgm.finetuning
+
+    assert qsgm.finetune is qsgm.finetuning.finetune
+    assert all(getattr(qsgm, name) is not None for name in qsgm.__all__)
+    assert not any((Path(qsgm.__file__).parent / f"{name}.py").exists() for name in qsgm.__all__)
+    with pytest.raises(AttributeError, match="'qsgm' has no attribute 'nothing'"):
+        qsgm.nothing  # noqa: B018

@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 from qsgm import QsgmError
-from qsgm.bundle import Bundle, load_bundle
+from qsgm.bundle import Bundle, Recipe, load_bundle
 from qsgm.train import calibrate, export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
@@ -23,6 +23,7 @@ from qsgm.train.fold import fold_net
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.sgm import Sgm
+from qsgm.tuned import ObjectDescription, save_object
 from qsgm.tuning import StepLoop
 from qsgm.weights import to_step_layout
 
@@ -113,7 +114,8 @@ def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:
         assert bundle.recipe("sgm", tuned, None).optimizer == "sgd"
         assert bundle.recipe("sgm", tuned, None).rates == RATES[tuned]
         assert bundle.recipe("sgm", tuned, "adam").rates == (3e-4,) * tuned
-    assert bundle.recipe("sgm", 1, None) == bundle.recipe("bp", 1, "adam")
+    assert bundle.recipe("sgm", 1, None) == Recipe("sgd", RATES[1])
+    assert bundle.recipe("bp", 1, None) == Recipe("adam", (1e-3,))
     assert bundle.recipe("bp", 3, None).rates == (1e-3,) * 3
     assert bundle.recipe("bp", 3, "sgd").rates == (1e-2,) * 3
 
@@ -248,3 +250,32 @@ def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> No
     gemm.attribute.append(onnx.helper.make_attribute("alpha", 2.0))
     with pytest.raises(QsgmError, match=r"step: .* computes 5 of the 6 int8 products of layer5"):
         refuse_float_products("step", model)
+
+
+def test_a_bundle_a_calibration_set_and_an_object_never_replace_each_other(
+    workplace: Workplace, bundle: Bundle, tmp_path: Path
+) -> None:
+    tuned = tmp_path / "tuned"
+    save_object(tuned, ObjectDescription("mug", "double", 0.0), bundle.network_with({}), {})
+    calib = workplace.folder / "calib"
+    kinds = {
+        bundle.folder: lambda folder: draw_calibration_set(folder, 1, 0),
+        calib: lambda folder: fold_and_quantize(Path("sgm.pt"), calib, folder, ignore),
+        tuned: lambda folder: fold_and_quantize(Path("sgm.pt"), calib, folder, ignore),
+    }
+    for folder, write in kinds.items():
+        before = sorted(path.name for path in folder.iterdir())
+        with pytest.raises(QsgmError, match="it holds another kind of output"):
+            write(folder)
+        assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_the_table_fits_a_terminal_of_80_columns(report: ExportReport) -> None:
+    shown = StringIO()
+    Console(file=shown, width=80).print(report)
+    lines = shown.getvalue().splitlines()
+    headers = ["int8,float", "int8,true", "ratio", "[dB]", "int8/float"]
+    assert any(all(header in line for header in headers) for line in lines)
+    for layer, one in report.layers.items():
+        row = next(line for line in lines if line.split()[:1] == [str(layer)])
+        assert row.split() == list(one.cells())

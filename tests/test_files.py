@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -211,3 +212,39 @@ def test_a_folder_without_its_marker_is_a_programming_error(tmp_path: Path) -> N
     with pytest.raises(ValueError, match=f"{MARKER} was not written"):
         replace_folder(tmp_path / "temporary", tmp_path / "final", MARKER)
     assert not (tmp_path / "final").exists()
+
+
+def test_a_place_without_a_name_is_refused_in_one_line() -> None:
+    with pytest.raises(QsgmError, match="cannot write /: it has no name"):
+        write_bytes_atomic(Path("/"), b"x")
+    assert "will not replace the folder /" in refusal(Path("/"))
+
+
+def test_a_disk_that_fills_up_while_the_block_runs_is_reported_in_one_line(tmp_path: Path) -> None:
+    def fill() -> None:
+        with new_folder(tmp_path / "mug", MARKER):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(QsgmError, match=r"cannot write .*mug: no space left on device; pass"):
+        fill()
+    assert names(tmp_path) == []
+
+
+def test_a_foreign_folder_is_refused_without_looking_further_than_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a" / "deep").mkdir(parents=True)
+    (tmp_path / "a" / "deep" / "file").write_text("x")
+    (tmp_path / "thesis.txt").write_text("mine")
+    looked_into: list[Path] = []
+    iterdir = Path.iterdir
+
+    def watched(self: Path) -> Iterator[Path]:
+        looked_into.append(self)
+        return iterdir(self)
+
+    monkeypatch.setattr(Path, "iterdir", watched)
+    monkeypatch.setattr(Path, "rglob", pytest.fail)
+    assert "'thesis.txt'" in refusal(tmp_path)
+    assert looked_into
+    assert set(looked_into) == {tmp_path}

@@ -13,7 +13,7 @@ from qsgm import QsgmError, finetune, load_bundle, load_object
 from qsgm.angles import encode_angle
 from qsgm.bundle import Bundle, head_file, step_file
 from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
-from qsgm.finetune import (
+from qsgm.finetuning import (
     Accuracy,
     FinetuneResult,
     Probe,

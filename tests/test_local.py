@@ -1,7 +1,5 @@
 """The differentiable training steps against autograd through plain torch convolutions."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
@@ -67,15 +65,6 @@ def made_up_gradient(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
 def flat_gradients(number: int, weights: Weights, objective: Tensor) -> tuple[Tensor, Tensor]:
     weight, bias = torch.autograd.grad(objective, list(weights[number]))
     return weight.permute(2, 3, 1, 0).flatten(0, 2), bias
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Threads that wait for each other on a busy machine take longer than this work does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("tuned", [1, 2, 3])

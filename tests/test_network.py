@@ -1,13 +1,11 @@
 """Exported trunk, head and network against torch and against each other."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
 import torch
-from torch import nn
+from nets import random_net
 
 from qsgm import QsgmError
 from qsgm.angles import AngleEncoding
@@ -18,24 +16,9 @@ from qsgm.train.graspnet import GraspNet, Loss, normalize
 from qsgm.weights import to_conv_layout, to_step_layout
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Threads that wait for each other on a busy machine take longer than this work does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def net() -> GraspNet:
-    torch.manual_seed(0)
-    net = GraspNet()
-    for norm in net.modules():
-        if isinstance(norm, nn.BatchNorm2d):
-            norm.running_mean.normal_()
-            norm.running_var.uniform_(0.1, 2)
-    return net.eval()
+    return random_net(0)
 
 
 @pytest.fixture(scope="module")

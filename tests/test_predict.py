@@ -3,16 +3,20 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rich.console import Console
 
 from qsgm.angles import AngleEncoding, angle_error, encode_angle
 from qsgm.errors import QsgmError
+from qsgm.pictures import _values
 from qsgm.predict import Detection, locate, refine
+from qsgm.report import detection_table, fidelity_table, plain_table, predict_json
 
 FRAME_HW = (480, 640)
 ROWS_COLS = (23, 33)
@@ -242,3 +246,21 @@ def test_a_second_look_works_in_a_frame_hardly_larger_than_a_window(
     detection = refine(coarse, frame_of_places(height, width), answers_at(64, 64, 0.5), 0.0)
     assert math.dist(detection.center_px, (64, 64)) < 24
     assert detection.angle_deg == pytest.approx(math.degrees(0.5), abs=1e-3)
+
+
+def test_a_turn_just_above_minus_90_is_reported_as_90_everywhere() -> None:
+    found = Detection(True, 0.9, (200.0, 300.0), (-120.0, 60.0), -89.998)
+    assert predict_json(found, (3, 23, 33), "mug", None)["angle_deg"] == 90.0
+    shown = StringIO()
+    Console(file=shown, width=80).print(detection_table(found, "mug"))
+    assert "+90.0°" in shown.getvalue()
+    assert ("turn (counter-clockwise)", "+90.0 deg") in _values(found)
+
+
+def test_a_name_that_looks_like_markup_is_shown_as_it_is() -> None:
+    shown = StringIO()
+    for name in ("[bold]", "[/x]"):
+        Console(file=shown, width=80).print(detection_table(ABSENT, name), plain_table(name))
+        assert name in shown.getvalue()
+    Console(file=shown, width=80).print(fidelity_table({}))
+    assert "[dB]" in shown.getvalue()

@@ -1,5 +1,6 @@
 """Pretraining as a whole, in a size that takes seconds."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,10 +8,14 @@ import pytest
 import torch
 
 from qsgm.errors import QsgmError
+from qsgm.train import partial as partial_module
+from qsgm.train import pretrain as module
 from qsgm.train.backbone import BackboneConfig
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.maml import MamlConfig
+from qsgm.train.evaluate import Score
+from qsgm.train.maml import MamlConfig, MetaTraining
 from qsgm.train.matching import MatchingConfig
+from qsgm.train.partial import Partial
 from qsgm.train.pretrain import PretrainConfig, pretrain
 
 TINY = PretrainConfig(
@@ -45,7 +50,10 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
     assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3"
     assert list(dict.fromkeys(stages)) == ["backbone", "tasks", "matching", "meta", "rates"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
-    assert checkpoint.card["command"] in (tmp_path / "sgm.md").read_text()
+    assert (checkpoint.card["device"], checkpoint.card["resumed"]) == ("cpu", False)
+    text = (tmp_path / "sgm.md").read_text()
+    assert checkpoint.card["command"] in text
+    assert "resumed" not in text
 
 
 def test_the_same_seed_gives_the_same_checkpoint_and_another_seed_another(tmp_path: Path) -> None:
@@ -73,6 +81,171 @@ def test_an_interrupted_pretraining_goes_on_where_it_stopped(tmp_path: Path) -> 
     unbroken = pretrain(tmp_path / "other.pt", 0, "cpu", silent, TINY)
     for name, value in unbroken.net.state_dict().items():
         assert torch.equal(resumed.net.state_dict()[name], value)
+    assert resumed.card["resumed"]
+    assert "interrupted and resumed" in output.with_suffix(".md").read_text()
+
+
+def stop_in_meta(stage: str, *_: object) -> None:
+    if stage == "meta":
+        raise KeyboardInterrupt
+
+
+def interrupted(output: Path) -> Path:
+    """The partial of a pretraining with seed 0 that got through its second stage."""
+    with pytest.raises(KeyboardInterrupt):
+        pretrain(output, 0, "cpu", stop_in_meta, TINY)
+    return output.with_name(output.name + ".partial")
+
+
+def stages_until_meta(output: Path) -> set[str]:
+    stages: set[str] = set()
+
+    def watch(stage: str, *_: object) -> None:
+        stages.add(stage)
+        stop_in_meta(stage)
+
+    with pytest.raises(KeyboardInterrupt):
+        pretrain(output, 0, "cpu", watch, TINY)
+    return stages
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda _: b"",
+        lambda _: b"hello",
+        lambda data: data[:-100],
+        lambda data: data[: len(data) // 2] + b"spoilt" + data[len(data) // 2 + 6 :],
+        lambda data: data[32:],  # without its digest
+    ],
+)
+def test_a_damaged_partial_counts_as_none(tmp_path: Path, spoil: Callable[[bytes], bytes]) -> None:
+    path = interrupted(tmp_path / "sgm.pt")
+    assert "backbone" not in stages_until_meta(tmp_path / "sgm.pt")
+    path.write_bytes(spoil(path.read_bytes()))
+    assert "backbone" in stages_until_meta(tmp_path / "sgm.pt")
+
+
+def test_a_folder_in_the_partials_place_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "sgm.pt.partial").mkdir()
+    with pytest.raises(QsgmError, match="exists and is not a file"):
+        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, TINY)
+
+
+def test_a_partial_of_another_version_is_not_taken_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "sgm.pt")
+    monkeypatch.setattr("qsgm.__version__", "99.0")
+    assert "backbone" in stages_until_meta(tmp_path / "sgm.pt")
+
+
+def test_seconds_are_counted_over_interruptions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr(partial_module, "perf_counter", lambda: clock[0])
+    first = Partial.open(tmp_path / "x", {"seed": 0})
+    clock[0] += 50
+    first.save(net=1)
+    clock[0] = 5.0  # another process, its clock started anew
+    second = Partial.open(tmp_path / "x", {"seed": 0})
+    clock[0] += 7
+    assert second.seconds == 57
+    assert Partial.open(tmp_path / "x", {"seed": 1}).seconds == 0
+
+
+def test_the_card_names_a_device_that_is_not_the_default(tmp_path: Path) -> None:
+    partial = Partial.open(tmp_path / "x", {})
+    card = module._card(3, "cuda", TINY, Score(0.0, 1.0, 2.0), partial)
+    assert card["command"] == "qsgm pretrain -o sgm.pt --seed 3 --device cuda"
+    assert "backbone on cuda" in module._card_text(tmp_path / "x", card)
+
+
+def test_a_backbone_that_blows_up_leaves_nothing(tmp_path: Path) -> None:
+    config = replace(TINY, backbone=replace(TINY.backbone, peak_rate=1e30))
+    with pytest.raises(QsgmError, match=r"stage `backbone`: GraspNet .* pass another --seed"):
+        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+    assert not list(tmp_path.iterdir())
+
+
+def test_sgms_that_blow_up_leave_no_output(tmp_path: Path) -> None:
+    config = replace(TINY, matching=replace(TINY.matching, peak_rate=1e30))
+    with pytest.raises(QsgmError, match=r"stage `matching`: Sgm .* pass another --seed"):
+        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+    assert not (tmp_path / "sgm.pt").exists()
+
+
+def test_meta_training_that_blows_up_leaves_no_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def blow_up(training: MetaTraining, _: object) -> None:
+        torch.nn.init.constant_(training.start[0][0], float("inf"))
+
+    monkeypatch.setattr(MetaTraining, "run", blow_up)
+    with pytest.raises(QsgmError, match="stage `meta`: GraspNet"):
+        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, TINY)
+    assert not (tmp_path / "sgm.pt").exists()
+
+
+def test_rates_that_all_diverge_leave_no_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "RATE_GRID", (1e38,))
+    config = replace(TINY, trial_epochs=3)
+    with pytest.raises(QsgmError, match=r"trial runs .* diverged"):
+        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+    assert [path.name for path in tmp_path.iterdir()] == ["sgm.pt.partial"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sgm.md", "where the model card goes"),
+        ("SGM.MD", "where the model card goes"),
+        ("folder", "got a folder"),
+        ("folder/..", "got a folder"),
+        ("file/sgm.pt", "cannot write"),
+        ("file/more/sgm.pt", "cannot write"),
+        ("card.pt", "card.md: it is there and no file"),
+        ("x" * 300, "cannot write"),
+    ],
+)
+def test_a_place_that_cannot_be_written_to_is_refused_before_training(
+    tmp_path: Path, name: str, message: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "card.md").mkdir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(QsgmError, match=message) as caught:
+        pretrain(tmp_path / name, 0, "cpu", lambda *_: pytest.fail("it was training"), TINY)
+    assert "\n" not in str(caught.value)
+
+
+def test_folders_on_the_way_to_the_output_are_made(tmp_path: Path) -> None:
+    interrupted(tmp_path / "new/folder/sgm.pt")
+
+
+def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path: Path) -> None:
+    threads: dict[str, int] = {}
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        pretrain(
+            tmp_path / "sgm.pt",
+            0,
+            "cpu",
+            lambda stage, *_: threads.update({stage: torch.get_num_threads()}),
+            TINY,
+        )
+        after = torch.get_num_threads()
+        with pytest.raises(KeyboardInterrupt):
+            pretrain(tmp_path / "other.pt", 0, "cpu", stop_in_meta, TINY)
+        after_interruption = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+    assert threads == {"backbone": 2, "tasks": 1, "matching": 1, "meta": 1, "rates": 1}
+    assert (after, after_interruption) == (2, 2)
 
 
 def test_a_partial_of_another_seed_is_not_taken_up(tmp_path: Path) -> None:

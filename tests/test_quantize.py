@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from qsgm import QsgmError
+from qsgm.runtime import session_options
 from qsgm.train.fold import FloatArray, FoldedConv, FoldedSgm
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import integer_operators, optimized_nodes
@@ -99,8 +100,7 @@ def run(
     model: onnx.ModelProto, level: ort.GraphOptimizationLevel, inputs: FloatArray
 ) -> tuple[FloatArray, float, list[np.ndarray]]:
     """Gradient, clipped fraction and hidden tensors."""
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
+    options = session_options()
     options.graph_optimization_level = level
     session = ort.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
     gradient, clipped, *hidden = session.run(None, {"inputs": inputs})

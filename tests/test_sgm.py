@@ -1,7 +1,5 @@
 """The SGM as a layer: nothing forward, its own gradient backward, and what its teacher is told."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -12,15 +10,6 @@ from qsgm.train.local import LayerState, local_step
 from qsgm.train.sgm import SGM_LAYERS, Sgm, SgmLayer, Teacher
 
 BATCH, LAYER = 6, 5
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Threads that wait for each other on a busy machine take longer than this work does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 class Case:

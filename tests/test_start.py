@@ -3,29 +3,17 @@
 import copy
 
 import torch
+from nets import random_net
 
-from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.graspnet import Loss
 from qsgm.train.local import outputs
 from qsgm.train.start import folded_start, write_back
 from qsgm.train.tasks import start_states
 
 
-def net_with_statistics(seed: int) -> GraspNet:
-    """A network whose batchnorms are far from the identity."""
-    torch.manual_seed(seed)
-    net = GraspNet()
-    for layer in net.layers:
-        if layer.norm is not None:
-            layer.norm.running_mean.normal_()
-            layer.norm.running_var.uniform_(0.3, 3.0)
-            torch.nn.init.uniform_(layer.norm.weight, 0.5, 2.0)
-            torch.nn.init.normal_(layer.norm.bias)
-    return net.eval()
-
-
 @torch.no_grad()
 def test_the_folded_start_answers_as_the_network_does() -> None:
-    net = net_with_statistics(0)
+    net = random_net(0)
     maps = torch.rand(4, 16, 13, 13)
     features = maps.flatten(2).transpose(1, 2)[None]
     raw = outputs(start_states(folded_start(net, 3), 1), features)[0]
@@ -34,7 +22,7 @@ def test_the_folded_start_answers_as_the_network_does() -> None:
 
 @torch.no_grad()
 def test_what_is_written_back_folds_to_what_was_learnt() -> None:
-    net = net_with_statistics(1)
+    net = random_net(1)
     learnt = [(w + torch.randn_like(w), b + 1.0) for w, b in folded_start(net, 3)]
     frozen = copy.deepcopy(net.layers[:3].state_dict())
     write_back(net, learnt)

@@ -1,7 +1,7 @@
 """Exported training steps and probes against plain torch convolutions and autograd."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ import onnx
 import onnxruntime as ort
 import pytest
 import torch
+from nets import random_net
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -25,7 +26,7 @@ from qsgm.train.graphs.inspection import integer_operators
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
 from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
-from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.graspnet import Loss
 from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.sgm import Sgm
 from qsgm.tuning import StepLoop
@@ -43,19 +44,9 @@ TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
 Arrays = dict[str, np.ndarray]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Threads that wait for each other on a busy machine take longer than this work does."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def net() -> FoldedNet:
-    torch.manual_seed(0)
-    return fold_net(GraspNet().eval())
+    return fold_net(random_net(0))
 
 
 def random_sgms(hidden: Sequence[int] | None = None) -> dict[int, FoldedSgm]:

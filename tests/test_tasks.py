@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from qsgm.angles import angle_error, decode_angle, encode_angle
+from qsgm.angles import AngleEncoding, angle_error, decode_angle, encode_angle
 from qsgm.crops import label_crops, plan_crops
+from qsgm.errors import QsgmError
+from qsgm.train.backbone import BackboneConfig, BackboneTraining
 from qsgm.train.evaluate import Score, best_rates, score
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.local import true_gradients
@@ -29,31 +31,64 @@ def test_the_offset_is_how_the_network_sees_the_demonstration_turned(offset: flo
 
 
 def test_a_drawn_batch_depends_on_its_number_and_seed_only() -> None:
-    crops, labels = CropStream(5, 10, 6)[3]
-    again, labels_again = CropStream(5, 10, 6)[3]
-    other, _ = CropStream(6, 10, 6)[3]
+    crops, labels = CropStream(5, 10, 6, "double")[3]
+    again, labels_again = CropStream(5, 10, 6, "double")[3]
+    other, _ = CropStream(6, 10, 6, "double")[3]
     assert torch.equal(crops, again)
     assert torch.equal(labels, labels_again)
     assert not torch.equal(crops, other)
     assert crops.shape == (6, 128, 128, 3)
 
 
-def test_the_score_agrees_with_numpy() -> None:
+@pytest.mark.parametrize("encoding", ["double", "paper"])
+def test_the_backbone_is_taught_angles_as_its_loss_encodes_them(encoding: AngleEncoding) -> None:
+    config = BackboneConfig(steps=3, frames_per_batch=4, crops_per_frame=6, loader_processes=0)
+    training = BackboneTraining(config, Loss(encoding), 5, "cpu")
+    (_, labels), *_ = training._batches()
+    drawn_with = {name: CropStream(5, 12, 6, name)[0][1] for name in ("double", "paper")}
+    assert not torch.equal(drawn_with["double"], drawn_with["paper"])
+    assert torch.equal(labels[0], drawn_with[encoding])
+    # The paper's angles lie in the right half-plane, doubled ones everywhere.
+    assert (labels[..., 2].min() >= 0) == (encoding == "paper")
+
+
+@pytest.mark.parametrize("encoding", ["double", "paper"])
+def test_the_score_agrees_with_numpy(encoding: AngleEncoding) -> None:
+    loss = Loss(encoding)
     plan = plan_crops((480, 640), (320, 240), np.random.default_rng(1), 60)
-    labels = torch.tensor(label_crops(plan))[None]
+    labels = torch.tensor(label_crops(plan, encoding=encoding))[None]
     generator = torch.Generator().manual_seed(0)
     # Layers that pass three features through, so that the features are the raw outputs.
     raw = torch.randn(1, 60, 3, generator=generator)
     start = [(torch.eye(3), torch.zeros(3))]
     tasks = TaskSet(raw[:, :, None].double(), labels, support=20)
-    got = score(start_states(start, 1), tasks, Loss())[0].tolist()
-    seen = Loss().activate(raw[0])[20:].numpy()
+    got = score(start_states(start, 1), tasks, loss)[0].tolist()
+    seen = loss.activate(raw[0])[20:].numpy()
     positive = labels[0, 20:, 0].numpy() > 0
-    predicted = decode_angle(seen[:, 1], seen[:, 2])
+    predicted = decode_angle(seen[:, 1], seen[:, 2], encoding)
     error = np.degrees(angle_error(predicted, plan.turn_rad[20:]))[positive].mean()
-    assert got[0] == pytest.approx(float(Loss()(raw[0, 20:], labels[0, 20:])), rel=1e-5)
+    assert got[0] == pytest.approx(float(loss(raw[0, 20:], labels[0, 20:])), rel=1e-5)
     assert got[1] == pytest.approx(((seen[:, 0] > 0.5) == positive).mean())
     assert got[2] == pytest.approx(error, rel=1e-4)
+
+
+@pytest.mark.parametrize("encoding", ["double", "paper"])
+def test_both_sides_of_the_seam_are_close(encoding: AngleEncoding) -> None:
+    seen, true = np.radians([89.0, 10.0]), np.radians([-89.0, 12.0])
+    labels = np.concatenate([np.ones((2, 1)), encode_angle(true, encoding)], axis=1)
+    channels = torch.tensor(0.9 * encode_angle(seen, encoding))
+    cosine = channels[:, 1].atanh() if encoding == "double" else channels[:, 1].logit()
+    raw = torch.stack([torch.ones(2), channels[:, 0].atanh(), cosine], dim=1)[None]
+    start = [(torch.eye(3), torch.zeros(3))]
+    tasks = TaskSet(raw[:, :, None], torch.tensor(labels, dtype=torch.float32)[None], support=0)
+    got = score(start_states(start, 1), tasks, Loss(encoding))[0]
+    assert got[2] == pytest.approx(2.0, abs=1e-2)
+
+
+def test_no_rates_are_best_when_every_run_diverged() -> None:
+    scores = {(rate,): Score(float("nan"), 0.0, 0.0) for rate in (1.0, 2.0)}
+    with pytest.raises(QsgmError, match=r"all 2 trial runs .* diverged; pass another --seed"):
+        best_rates(scores)
 
 
 def test_the_best_rates_are_those_with_the_lowest_finite_loss() -> None:

@@ -90,3 +90,23 @@ def test_a_description_without_one_of_its_keys_is_refused_by_that_key(
     path.write_text(json.dumps({k: v for k, v in description.items() if k != key}))
     with pytest.raises(QsgmError, match=f"'{key}' holds nothing"):
         load_object(saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("encoding", "triple"), ("offset_rad", float("nan")), ("offset_rad", 1e999)]
+)
+def test_a_description_that_says_nonsense_is_refused(saved: Path, key: str, value: object) -> None:
+    path = saved / "object.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    assert "expected encoding double or paper and a finite offset_rad" in refusal(saved)
+
+
+def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Path) -> None:
+    save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_3.onnx").read_bytes(), {})
+    text = refusal(tmp_path / "mug")
+    assert "takes ['crops'] and gives ['features'], expected a frame and its heatmap" in text
+
+
+def test_a_frame_that_does_not_fit_the_network_is_refused(saved: Path) -> None:
+    with pytest.raises(QsgmError, match=r"does not fit .*; tune the object again"):
+        load_object(saved).heatmap(np.zeros((128, 128, 5), np.uint8))

@@ -5,5 +5,4 @@ accuracy  untouched, synthetic gradients in int8 and float, backpropagation: sam
 staging   scenes made from a demonstration: the object elsewhere, turned, in other light, or gone
 scenes    teach on a frame, find the object in such scenes
 speed     seconds per stage in processes of their own, next to the same job in torch
-torchjob  that job
 """

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle
-from qsgm.finetune import Accuracy, Settings, Watch, prepare, train
+from qsgm.finetuning import Accuracy, Settings, Watch, prepare, train
 from qsgm.report import accuracy_json, number, plain_table
 
 UNTOUCHED = "untouched"

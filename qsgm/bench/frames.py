@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.images import read_frame
+from qsgm.images import read_demonstration, read_frame
 
 MANIFEST = "manifest.json"
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -35,7 +35,7 @@ class BenchFrame:
 
     def read(self) -> NDArray[np.uint8]:
         """The frame (H, W, 3) BGR."""
-        return read_frame(self.path)
+        return read_demonstration(self.path)
 
     def read_mask(self) -> NDArray[np.bool_]:
         """Where the object is: (H, W).

@@ -17,7 +17,7 @@ from qsgm.angles import angle_error
 from qsgm.bench.frames import BenchFrame
 from qsgm.bench.staging import Scene, cut_out, make_scenes
 from qsgm.bundle import Bundle
-from qsgm.finetune import Settings, Watch, prepare, train
+from qsgm.finetuning import Settings, Watch, prepare, train
 from qsgm.images import write_png
 from qsgm.pictures import draw_detection
 from qsgm.predict import Detection

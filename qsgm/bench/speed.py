@@ -22,7 +22,7 @@ from rich.console import Group, RenderableType
 from qsgm.bundle import Bundle, head_file
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetune import Prepared, Settings, Watch, prepare
+from qsgm.finetuning import Prepared, Settings, Watch, prepare
 from qsgm.images import read_demonstration
 from qsgm.report import number, plain_table
 from qsgm.tuning import BATCH
@@ -101,7 +101,7 @@ def run_once(name: str, frame: Path, bundle: Bundle, settings: Settings) -> Seco
     )
     with tempfile.TemporaryDirectory() as home:
         if name == TORCH:
-            job = ["qsgm.bench.torchjob", str(frame), str(folder), layers, epochs, seed, threads]
+            job = ["qsgm.train.torchjob", str(frame), str(folder), layers, epochs, seed, threads]
         else:
             job = ["qsgm.cli", "finetune", "--json", "-o", f"{home}/object", *VARIANTS[name]]
             job += ["--layers", layers, "--epochs", epochs, "--seed", seed, "--threads", threads]

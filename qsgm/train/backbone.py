@@ -76,7 +76,7 @@ class BackboneTraining:
 
     def _batches(self) -> Iterator[tuple[Tensor, Tensor]]:
         frames = self.config.steps * self.config.frames_per_batch
-        stream = CropStream(self.seed, frames, self.config.crops_per_frame)
+        stream = CropStream(self.seed, frames, self.config.crops_per_frame, self.loss.encoding)
         rest = torch.utils.data.Subset(
             stream, range(self.step * self.config.frames_per_batch, frames)
         )

@@ -7,11 +7,13 @@ a time, and of each run only its current step.
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
+from math import isfinite
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -20,7 +22,7 @@ from torch import Tensor
 
 from qsgm.errors import QsgmError
 from qsgm.fidelity import LayerFidelity, compare, mean_over_run
-from qsgm.images import read_frame
+from qsgm.images import read_demonstration
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.fold import FloatArray, FoldedNet, FoldedSgm, fold_net, fold_sgm
 from qsgm.train.graspnet import LAYERS
@@ -32,6 +34,7 @@ from qsgm.tuning import BATCH, rate_factor
 from qsgm.weights import to_step_layout
 
 MANIFEST = "manifest.json"
+FORMAT, VERSION = "qsgm-calibration", 1
 CROPS = 400
 EPOCHS = 40  # as many steps as 20 epochs on the 800 crops of the device
 MOST_LAYERS = 3
@@ -56,6 +59,15 @@ class Demonstration:
     center_px: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """What the manifest says of one frame: a name in the same folder, its digest, its object."""
+
+    file: str
+    sha256: str
+    center_px: tuple[float, float]
+
+
 class CalibrationSet:
     """The frames that a folder's manifest lists; each is read when its turn comes."""
 
@@ -64,33 +76,71 @@ class CalibrationSet:
         path = folder / MANIFEST
         try:
             self.manifest_bytes = path.read_bytes()
-            listed = json.loads(self.manifest_bytes)["frames"]
-            self._frames = [(f["file"], f["sha256"], tuple(f["center_px"])) for f in listed]
+            self._entries = _entries(json.loads(self.manifest_bytes))
         except OSError as error:
             raise QsgmError(
                 f"{folder} is no calibration set, it has no {MANIFEST};"
                 f" make one with `qsgm draw-calibration -o {folder}`"
             ) from error
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
             raise QsgmError(
                 f'{path} is damaged: expected {{"frames": [{{"file", "sha256", "center_px"}}]}};'
                 " make it again with `qsgm draw-calibration`"
             ) from error
-        if not self._frames:
+        if not self._entries:
             raise QsgmError(f"{path} lists no frames: there is nothing to calibrate on")
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._entries)
 
     def __getitem__(self, i: int) -> Demonstration:
-        name, sha256, center_px = self._frames[i]
-        image = read_frame(self.folder / name)
-        if hashlib.sha256((self.folder / name).read_bytes()).hexdigest() != sha256:
+        entry = self._entries[i]
+        path = self.folder / entry.file
+        image = read_demonstration(path)
+        if hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
             raise QsgmError(
-                f"{self.folder / name} is not the frame the manifest describes (its sha256"
+                f"{path} is not the frame the manifest describes (its sha256"
                 " differs); restore it or make the set again with `qsgm draw-calibration`"
             )
-        return Demonstration(image, center_px)
+        (x, y), (height, width) = entry.center_px, image.shape[:2]
+        if x >= width or y >= height:
+            raise QsgmError(
+                f"{self.folder / MANIFEST} has the object of {entry.file} at ({x:g}, {y:g}) px,"
+                f" outside its frame of {width}x{height}; correct its center_px"
+            )
+        return Demonstration(image, entry.center_px)
+
+
+def _entries(manifest: Any) -> list[_Entry]:
+    """Every frame's entry; the manifest may name its format and version.
+
+    Raises ValueError, KeyError, TypeError, ArithmeticError or RecursionError for a damaged one.
+    """
+    if not isinstance(manifest, dict):
+        raise TypeError("not a JSON object")
+    named = manifest.get("format", FORMAT), manifest.get("version", VERSION)
+    if named != (FORMAT, VERSION):
+        raise ValueError(f"another format: {named!r}")
+    return [
+        _entry(**{name: f[name] for name in _Entry.__annotations__}) for f in manifest["frames"]
+    ]
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a name stays in its folder, and in its line of a message."""
+    return name.isprintable() and not re.search(r"[/\\]", name) and name not in ("", ".", "..")
+
+
+def _entry(file: Any, sha256: Any, center_px: Any) -> _Entry:
+    if not isinstance(file, str) or not _is_plain(file):
+        raise ValueError(f"not a plain file name: {file!r}")
+    if not isinstance(sha256, str):
+        raise TypeError(f"no digest: {sha256!r}")
+    x, y = center_px
+    for value in (x, y):
+        if type(value) not in (int, float) or not isfinite(value) or value < 0:
+            raise ValueError(f"no place in a frame: {center_px!r}")
+    return _Entry(file, sha256, (x, y))
 
 
 class Observer(Protocol):

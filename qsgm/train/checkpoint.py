@@ -1,16 +1,18 @@
 """`sgm.pt`: a pretrained network with its SGMs, learning rates and model card."""
 
 import json
-import pickle
+import struct
 import warnings
 import zipfile
 from dataclasses import asdict, dataclass
 from io import BytesIO
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
+from qsgm.angles import AngleEncoding
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
 from qsgm.train.graspnet import GraspNet, Loss
@@ -19,7 +21,19 @@ from qsgm.train.sgm import SGM_LAYERS, Sgm
 FORMAT = "qsgm-checkpoint"
 VERSION = 1
 LARGEST_BYTES = 64 * 2**20
+MOST_HIDDEN, WIDEST_HIDDEN = 4, 1024
+MOST_TUNED = 3
 _MEND = "make one with `qsgm pretrain -o sgm.pt`"
+# What parts of a wrong type, size or shape raise on their way into modules and numbers.
+_UNFIT = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    MemoryError,
+)
 
 
 @dataclass(frozen=True)
@@ -57,53 +71,109 @@ def load_checkpoint(path: Path) -> Checkpoint:
         QsgmError: it is missing, broken, not finite, or not such a file.
     """
     data = _read(path)
-    if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
+    if not _is_ours(data):
         raise QsgmError(f"{path} is no qsgm checkpoint of version {VERSION}; {_MEND}")
     try:
         net = GraspNet()
         net.load_state_dict(data["net"])
-        sgms = {int(layer): _sgm(int(layer), data) for layer in data["sgms"]}
-        loss = Loss(**data["loss"])
-        rates = {int(n): tuple(float(r) for r in rates) for n, rates in data["rates"].items()}
+        sgms = {layer: _sgm(layer, data) for layer in data["sgms"]}
+        loss, rates = _loss(data["loss"]), _rates(data["rates"])
         card = dict(json.loads(data["card"]))
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0][:160]
-        raise QsgmError(f"{path} does not fit this version of qsgm ({reason}); {_MEND}") from error
+    except _UNFIT as error:
+        raise QsgmError(
+            f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"
+        ) from error
     _check_finite(path, net, *sgms.values())
     return Checkpoint(net.eval(), sgms, loss, rates, card)
 
 
 def _read(path: Path) -> Any:
-    if not path.is_file():
-        raise QsgmError(f"{path}: expected a checkpoint, found no such file; {_MEND}")
-    if path.stat().st_size > LARGEST_BYTES:
-        size = path.stat().st_size // 2**20
-        raise QsgmError(f"{path} has {size} MB, a checkpoint has less than 64 MB; {_MEND}")
+    _check_size(path)
     try:
         with warnings.catch_warnings():  # torch wonders aloud about files that are not its own
             warnings.simplefilter("ignore")
             return torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-        RuntimeError,
-        EOFError,
-        ValueError,
-        OSError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        TypeError,
-    ) as error:
+    except Exception as error:  # what torch raises depends on where the file is broken
         raise QsgmError(f"{path} is not a readable checkpoint; {_MEND}") from error
 
 
-def _sgm(layer: int, data: dict[str, Any]) -> Sgm:
-    if layer not in SGM_LAYERS:
-        raise ValueError(f"there is no SGM behind layer {layer}")
-    sgm = Sgm(layer, [int(width) for width in data["hidden"][layer]])
+def _check_size(path: Path) -> None:
+    """Refuse what would fill the memory, before any of it is read."""
+    try:
+        if not path.is_file():
+            raise QsgmError(f"{path}: expected a checkpoint, found no such file; {_MEND}")
+        size = max(path.stat().st_size, _unpacked_bytes(path))
+    except OSError as error:
+        raise QsgmError(f"{path} is not a readable checkpoint; {_MEND}") from error
+    if size > LARGEST_BYTES:
+        raise QsgmError(f"{path} has {size // 2**20} MB, a checkpoint has less than 64; {_MEND}")
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Size of everything in the archive that a checkpoint is; 0 for other files."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error):
+        return 0
+
+
+def _is_ours(data: Any) -> bool:
+    if not isinstance(data, dict):
+        return False
+    got = data.get("format"), data.get("version")
+    return tuple(map(type, got)) == (str, int) and got == (FORMAT, VERSION)
+
+
+def _sgm(layer: Any, data: dict[str, Any]) -> Sgm:
+    if type(layer) is not int or layer not in SGM_LAYERS:
+        raise ValueError(f"there is no SGM behind layer {layer!r}")
+    sgm = Sgm(layer, _hidden(data["hidden"][layer]))
     sgm.load_state_dict(data["sgms"][layer])
     return sgm.eval()
+
+
+def _hidden(widths: Any) -> list[int]:
+    """Checked before anything of these widths is made."""
+    if not isinstance(widths, list | tuple) or not 1 <= len(widths) <= MOST_HIDDEN:
+        raise ValueError(f"an SGM has 1 to {MOST_HIDDEN} hidden widths")
+    for width in widths:
+        if type(width) is not int or not 1 <= width <= WIDEST_HIDDEN:
+            raise ValueError(f"a hidden width is not a whole number from 1 to {WIDEST_HIDDEN}")
+    return list(widths)
+
+
+def _loss(fields: Any) -> Loss:
+    loss = Loss(**fields)
+    if loss.encoding not in get_args(AngleEncoding):
+        raise ValueError(f"the angle encoding is none of {get_args(AngleEncoding)}")
+    if not 0 <= _number(loss.label_smoothing) < 1:
+        raise ValueError("the label smoothing is not in [0, 1)")
+    if _number(loss.angle_weight) <= 0:
+        raise ValueError("the angle's weight is not positive")
+    return loss
+
+
+def _rates(by_tuned: Any) -> dict[int, tuple[float, ...]]:
+    if sorted(by_tuned) != list(range(1, MOST_TUNED + 1)):
+        raise ValueError(f"the rates are not for 1 to {MOST_TUNED} tuned layers")
+    rates = {int(tuned): tuple(map(_number, of_layers)) for tuned, of_layers in by_tuned.items()}
+    for tuned, of_layers in rates.items():
+        if len(of_layers) != tuned or min(of_layers) <= 0:
+            raise ValueError(f"the rates for {tuned} layer(s) are not {tuned} positive number(s)")
+    return rates
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (int, float) or not isfinite(value):
+        raise ValueError("a rate or weight is not a finite number")
+    return float(value)
+
+
+def _one_line(error: BaseException) -> str:
+    """The start of what an error says, or its kind where that cannot be shown."""
+    first = next(iter(str(error).splitlines()), "")[:160]
+    return first if first and first.isprintable() else type(error).__name__
 
 
 def _check_finite(path: Path, *modules: torch.nn.Module) -> None:

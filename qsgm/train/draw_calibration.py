@@ -9,14 +9,16 @@ from typing import Any
 import cv2
 import numpy as np
 
+from qsgm import defaults
 from qsgm.files import new_folder
 from qsgm.images import write_png
 from qsgm.train.draw_demo import draw_demo
 from qsgm.train.objects import OBJECT_KINDS, TABLE_KINDS, DrawnFrame, draw_frame
 
 MANIFEST = "manifest.json"
-DEFAULT_COUNT = 24
-DEFAULT_SEED = 0
+DEMO_OBJECT, DEMO_SCENE = "demo_object.png", "demo_scene.png"
+# No other folder that qsgm writes holds a file of this name; `manifest.json` is in two kinds.
+MARKER = DEMO_SCENE
 # Sets these frames apart from those that pretraining draws with the same seed.
 STREAM = 24001
 JPEG_QUALITY = 92
@@ -48,8 +50,8 @@ far.
 
 def draw_calibration_set(
     folder: Path,
-    count: int = DEFAULT_COUNT,
-    seed: int = DEFAULT_SEED,
+    count: int = defaults.CALIBRATION_FRAMES,
+    seed: int = 0,
     watch: Watch | None = None,
 ) -> None:
     """Draw `count` frames and the two demo pictures into a new folder.
@@ -65,7 +67,7 @@ def draw_calibration_set(
     """
     command = f"qsgm draw-calibration --count {count} --seed {seed} -o calib"
     object_kinds = np.random.default_rng([STREAM, seed]).permutation(OBJECT_KINDS).tolist()
-    with new_folder(folder, MANIFEST) as new:
+    with new_folder(folder, MARKER) as new:
         frames = []
         for i in range(count):
             own_seed = [STREAM, seed, i]
@@ -106,11 +108,11 @@ def _write_frame(folder: Path, name: str, drawn: DrawnFrame, seed: list[int]) ->
 def _write_demo(folder: Path, seed: int) -> dict[str, Any]:
     """Write both demo pictures; returns their entry in the manifest."""
     demo = draw_demo(seed + _DEMO_SEED_OFFSET)
-    write_png(folder / "demo_object.png", demo.demonstration)
-    write_png(folder / "demo_scene.png", demo.scene)
+    write_png(folder / DEMO_OBJECT, demo.demonstration)
+    write_png(folder / DEMO_SCENE, demo.scene)
     return {
-        "object": "demo_object.png",
-        "scene": "demo_scene.png",
+        "object": DEMO_OBJECT,
+        "scene": DEMO_SCENE,
         "scene_center_px": list(demo.center_px),
         "scene_angle_deg": demo.angle_deg,
     }

@@ -54,6 +54,8 @@ from qsgm.train.graspnet import LAYERS, normalize
 from qsgm.train.quantize import QuantizedSgm, quantize_sgm
 
 SEED = 0
+# No other folder that qsgm writes holds a file of this name; `manifest.json` is in two kinds.
+MARKER = trunk_file(1)
 OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
 TUNED = range(1, MOST_LAYERS + 1)
 # Folding moves rounding errors about, no more: larger than this, it went wrong.
@@ -84,7 +86,7 @@ def fold_and_quantize(
         QsgmError: the checkpoint or the calibration set cannot be used, the output folder holds
             something else, or the exported graphs would not do what they are for.
     """
-    check_replaceable(output_folder, MANIFEST)
+    check_replaceable(output_folder, MARKER)
     trainee = prepare(load_checkpoint(checkpoint_path))
     frames = CalibrationSet(calib_folder)
     fold_error = check_folding(trainee, frames[0])
@@ -111,7 +113,7 @@ def fold_and_quantize(
         len(frames),
         sha256(frames.manifest_bytes),
     )
-    with new_folder(output_folder, MANIFEST) as new:
+    with new_folder(output_folder, MARKER) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
         manifest = json.dumps(describe(trainee, files), indent=1, sort_keys=True)

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
 from qsgm.report import fidelity_json, plain_table
@@ -14,7 +16,21 @@ from qsgm.train.calibrate import LABEL_LOW, MinMax
 from qsgm.train.fold import FoldedSgm
 from qsgm.train.quantize import QuantizedSgm, SgmRanges
 
-_HEADERS = ("layer", "range", "scale", "cos int8,float", "norm int8/true", "SQNR dB", "bytes")
+# (line break: in a terminal only)
+_HEADERS = (
+    "\nlayer",
+    "\nrange",
+    "\nscale",
+    "cos\nint8,float",
+    "cos\nint8,true",
+    "norm\nratio",
+    "SQNR\n[dB]",
+    "bytes\nint8/float",
+)
+LEGEND = (
+    "range, scale: of the activation channels; cos: cosine of int8, float and true gradients; "
+    "norm ratio: |int8|/|true|; bytes: of the SGM's constants"
+)
 
 
 @dataclass(frozen=True)
@@ -76,12 +92,13 @@ class LayerReport:
         fine, coarse = self.activation_scale
         return (
             str(self.sgm.layer),
-            f"{low:.2g} to {high:.3g}",
-            f"{fine:.2g} to {coarse:.2g}",
+            f"{low:.2g}..{high:.2g}",
+            f"{fine:.1g}..{coarse:.1g}",
             f"{self.fidelity.cos_int8_float:.5f}",
+            f"{self.fidelity.cos_int8_true:.3f}",
             f"{self.fidelity.norm_ratio_int8_true:.2f}",
             f"{self.fidelity.sqnr_db:.1f}",
-            f"{self.int8_bytes} of {self.float_bytes}",
+            f"{self.int8_bytes}/{self.float_bytes}",
         )
 
 
@@ -109,8 +126,8 @@ class ExportReport:
             "bundle_bytes": self.bundle_bytes,
         }
 
-    def __rich__(self) -> Table:
-        return table(self)
+    def __rich__(self) -> RenderableType:
+        return Group(table(self), Text(LEGEND, style="dim"))
 
 
 @dataclass(frozen=True)
@@ -127,8 +144,9 @@ class Provenance:
 def table(report: ExportReport) -> Table:
     """One row per SGM layer."""
     result = plain_table(f"{report.output}: int8 SGMs, mean over the calibration runs")
+    result.padding = 0  # the lines between columns are blanks, and 80 columns have to do
     for header in _HEADERS:
-        result.add_column(header, justify="right")
+        result.add_column(Text(header), justify="right", no_wrap=True)  # no markup: [dB]
     for layer in report.layers.values():
         result.add_row(*layer.cells())
     return result
@@ -136,7 +154,8 @@ def table(report: ExportReport) -> Table:
 
 def model_card(report: ExportReport, provenance: Provenance) -> str:
     """The bundle's README.md."""
-    rows = [_HEADERS, ("--:",) * len(_HEADERS), *(one.cells() for one in report.layers.values())]
+    headers = [" ".join(header.split()) for header in _HEADERS]
+    rows = [headers, ["--:"] * len(headers), *(one.cells() for one in report.layers.values())]
     lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     card = json.dumps(provenance.card, indent=1, sort_keys=True)
     return f"""# GraspNet with int8 synthetic gradient modules
@@ -172,8 +191,7 @@ How the checkpoint was pretrained, and what it scored:
 
 u8 activations, weights of two s8 planes (one holds what rounding to the other left), a scale for
 every channel (calibrator: {MinMax.name}), float gradients out. Measured while the int8 SGMs
-fine-tuned the last three layers on the calibration frames; range and scale are those of the
-activation channels.
+fine-tuned the last three layers on the calibration frames. {LEGEND.capitalize()}.
 
 {lines}
 """

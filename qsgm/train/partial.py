@@ -1,41 +1,68 @@
-"""Unfinished pretraining, kept beside its output so that the same command goes on with it."""
+"""Unfinished pretraining, kept beside its output so that the same command goes on with it.
 
-import pickle
+The file is a SHA-256 digest and behind it what torch wrote: bytes that have changed are noticed,
+and an unfinished pretraining that is damaged counts as none.
+"""
+
+import hashlib
 from io import BytesIO
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import torch
 
 from qsgm.files import write_bytes_atomic
 
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
 
 class Partial:
     """What is done so far: a dictionary in a file that belongs to one seed and configuration."""
 
-    def __init__(self, path: Path, identity: dict[str, Any], data: dict[str, Any]) -> None:
+    def __init__(
+        self, path: Path, identity: dict[str, Any], data: dict[str, Any], spent_s: float = 0.0
+    ) -> None:
         self.path, self.identity, self.data = path, identity, data
         self.resumed = bool(data)
+        self._began = perf_counter() - spent_s
 
     @staticmethod
     def open(output: Path, identity: dict[str, Any]) -> "Partial":
-        """Take up `<output>.partial` if it is of the same identity, else start from nothing."""
+        """Take up `<output>.partial` if whole and of the same identity, else start from nothing."""
         path = output.with_name(output.name + ".partial")
-        try:
-            saved = torch.load(path, map_location="cpu", weights_only=True)
-        except (OSError, RuntimeError, pickle.UnpicklingError, EOFError):
-            saved = None
-        same = isinstance(saved, dict) and saved.get("identity") == identity
-        return Partial(path, identity, saved["data"] if same else {})
+        saved = _read(path)
+        if saved.get("identity") != identity:
+            return Partial(path, identity, {})
+        return Partial(path, identity, saved["data"], saved["seconds"])
+
+    @property
+    def seconds(self) -> float:
+        """Time spent so far, before interruptions too."""
+        return perf_counter() - self._began
 
     def save(self, **parts: Any) -> None:
         """Add or replace parts; `None` drops one."""
         self.data |= parts
         self.data = {name: part for name, part in self.data.items() if part is not None}
         buffer = BytesIO()
-        torch.save({"identity": self.identity, "data": self.data}, buffer)
-        write_bytes_atomic(self.path, buffer.getvalue())
+        whole = {"identity": self.identity, "data": self.data, "seconds": self.seconds}
+        torch.save(whole, buffer)
+        body = buffer.getvalue()
+        write_bytes_atomic(self.path, hashlib.sha256(body).digest() + body)
 
     def remove(self) -> None:
         """Forget it all; the output is written."""
         self.path.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What :meth:`Partial.save` wrote; empty if there is nothing, or not exactly that."""
+    try:
+        content = path.read_bytes()
+        digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(body).digest() != digest:
+            return {}
+        return dict(torch.load(BytesIO(body), map_location="cpu", weights_only=True))
+    except Exception:  # someone else's file, whatever is wrong with it
+        return {}

@@ -6,20 +6,22 @@
 4. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
 
 What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
-command with the same seed.
+version's same command: output, seed and device.
 """
 
 import json
+import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from errno import EACCES
 from itertools import product
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import qsgm
 from qsgm.errors import QsgmError
@@ -74,7 +76,7 @@ def pretrain(
     """Pretrain and write `output`.
 
     Args:
-        output: `sgm.pt`; its model card goes beside it, `sgm.md`.
+        output: `sgm.pt`; its model card goes beside it, `sgm.md`. Folders on the way are made.
         seed: of everything drawn at random.
         device: `cpu` or `cuda`, for the backbone; the rest is small and stays on the CPU.
         watch: told about progress.
@@ -82,24 +84,56 @@ def pretrain(
         loss: and with it the angle encoding.
 
     Raises:
-        QsgmError: the device is not there, or training ended in NaN.
+        QsgmError: the device is not there, `output` cannot be written, or training diverged:
+            weights are not finite, or fine-tuning fails at every rate. Then no `output` is written.
     """
     config, loss = config or PretrainConfig(), loss or Loss()
     _check_device(device)
-    started = perf_counter()
-    partial = Partial.open(output, {"seed": seed, "config": repr(config), "loss": repr(loss)})
+    _check_output(output)
+    partial = Partial.open(output, _identity(seed, device, config, loss))
     net = _backbone(partial, config, loss, seed, device, watch)
+    with one_thread():
+        sgms, rates, score = _learn_to_tune(partial, net, config, loss, seed, watch)
+    card = _card(seed, device, config, score, partial)
+    checkpoint = Checkpoint(net, sgms, loss, rates, card)
+    save_checkpoint(output, checkpoint)
+    write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
+    partial.remove()
+    return checkpoint
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: thousands of tiny operations only wait for a second one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _identity(seed: int, device: str, config: PretrainConfig, loss: Loss) -> dict[str, Any]:
+    """What must be the same for an unfinished pretraining to be taken up."""
+    return {
+        "qsgm": qsgm.__version__,
+        "seed": seed,
+        "device": device,
+        "config": repr(config),
+        "loss": repr(loss),
+    }
+
+
+def _learn_to_tune(
+    partial: Partial, net: GraspNet, config: PretrainConfig, loss: Loss, seed: int, watch: Watch
+) -> tuple[dict[int, Sgm], dict[int, tuple[float, ...]], Score]:
+    """Stages 2 to 4: SGMs, rates, and how well they do; `net` gets its new start."""
     tasks = _draw(net, config.tasks, config.crops_per_task, seed + 1, loss, watch)
     sgms = _match(partial, net, tasks, config, loss, seed, watch)
     rates = _meta_train(partial, net, sgms, tasks, config, loss, seed, watch)
     trial = _draw(net, config.trial_tasks, config.crops_per_task, seed + 2, loss, watch)
     all_rates, score = _choose_rates(net, sgms, rates, trial, config, loss, watch)
-    card = _card(seed, config, score, perf_counter() - started, partial.resumed)
-    checkpoint = Checkpoint(net, sgms, loss, all_rates, card)
-    save_checkpoint(output, checkpoint)
-    write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
-    partial.remove()
-    return checkpoint
+    return sgms, all_rates, score
 
 
 def _backbone(
@@ -118,9 +152,11 @@ def _backbone(
         mean = value if mean == 0.0 else 0.98 * mean + 0.02 * value
         watch("backbone", step, config.backbone.steps, {"loss": mean})
         if step % SAVE_EVERY == 0:
+            _refuse_unless_finite("backbone", training.net)
             partial.save(backbone=training.state())
 
     net = _portable(training.run(after_step))
+    _refuse_unless_finite("backbone", net)
     partial.save(backbone=None, net=net.state_dict())
     return net
 
@@ -169,6 +205,7 @@ def _match(
 
     for layer, sgm in sgms.items():
         fit_sgm(sgm, examples[layer], config.matching, seed + layer, after_step)
+    _refuse_unless_finite("matching", *sgms.values())
     partial.save(sgms={layer: sgm.state_dict() for layer, sgm in sgms.items()})
     return sgms
 
@@ -197,10 +234,12 @@ def _meta_train(
                 mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
         watch("meta", step, config.maml.outer_steps, dict(mean))
         if step % SAVE_EVERY == 0:
+            _refuse_unless_finite("meta", *sgms.values())
             partial.save(meta=training.state())
 
     training.run(after_step)
     write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
+    _refuse_unless_finite("meta", net, *sgms.values())
     return tuple(float(rate) for rate in training.log_rates.detach().exp())
 
 
@@ -248,16 +287,45 @@ def _check_device(device: str) -> None:
         raise QsgmError("--device cuda: torch sees no CUDA device here; use --device cpu")
 
 
+def _check_output(output: Path) -> None:
+    """Find out before the training whether its result can be written; makes the folders."""
+    if output.suffix.lower() == ".md":
+        raise QsgmError(f"-o {output}: that is where the model card goes; pass a name like sgm.pt")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        if output.is_dir():
+            raise QsgmError(f"-o {output}: expected a file, got a folder; pass a name like sgm.pt")
+        for path in (output, output.with_suffix(".md")):
+            if path.exists() and not path.is_file():
+                raise QsgmError(f"cannot write {path}: it is there and no file; pass another name")
+        if not os.access(output.parent, os.W_OK | os.X_OK):
+            raise PermissionError(EACCES, os.strerror(EACCES))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise QsgmError(f"cannot write {output}: {reason}; pass another place") from error
+
+
+def _refuse_unless_finite(stage: str, *modules: nn.Module) -> None:
+    for module in modules:
+        if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
+            raise QsgmError(
+                f"pretraining diverged in stage `{stage}`: {type(module).__name__} has weights that"
+                " are not finite; pass another --seed, or lower the rates in PretrainConfig"
+            )
+
+
 def _card(
-    seed: int, config: PretrainConfig, score: Score, seconds: float, resumed: bool
+    seed: int, device: str, config: PretrainConfig, score: Score, partial: Partial
 ) -> dict[str, Any]:
+    on_device = "" if device == "cpu" else f" --device {device}"
     return {
-        "command": f"qsgm pretrain -o sgm.pt --seed {seed}",
+        "command": f"qsgm pretrain -o sgm.pt --seed {seed}{on_device}",
         "qsgm": qsgm.__version__,
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} thread(s)",
-        "seconds": round(seconds),
-        "resumed": resumed,
+        "device": device,
+        "seconds": round(partial.seconds),
+        "resumed": partial.resumed,
         "config": asdict(config),
         "drawn_objects": {name: round(value, 4) for name, value in asdict(score).items()},
     }
@@ -265,15 +333,16 @@ def _card(
 
 def _card_text(output: Path, card: dict[str, Any]) -> str:
     figures = "\n".join(f"- {name}: {value}" for name, value in card["drawn_objects"].items())
+    resumed = ", interrupted and resumed" if card["resumed"] else ""
     return f"""# {output.name}
 
 GraspNet and the static SGMs behind its layers 4 and 5, batchnorm not yet folded. Made by
 
     {card["command"]}
 
-in {card["seconds"]} s ({card["machine"]}, torch {card["torch"]}, qsgm {card["qsgm"]}), on drawn
-objects alone: no photograph was seen. Objects drawn anew, tuned by these SGMs in float, three
-layers:
+in {card["seconds"]} s{resumed} (backbone on {card["device"]}; {card["machine"]},
+torch {card["torch"]}, qsgm {card["qsgm"]}), on drawn objects alone: no photograph was seen. Objects
+drawn anew, tuned by these SGMs in float, three layers:
 
 {figures}
 

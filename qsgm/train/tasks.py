@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from qsgm.angles import decode_angle, mean_direction, wrap_half_turn
+from qsgm.angles import AngleEncoding, decode_angle, mean_direction, wrap_half_turn
 from qsgm.crops import CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.train.graspnet import LAYERS, GraspNet, Loss, normalize
 from qsgm.train.local import LayerState
@@ -30,8 +30,11 @@ LEAST_ELONGATION = 1.25
 class CropStream(Dataset[tuple[Tensor, Tensor]]):
     """Item i: crops (n, 128, 128, 3) uint8 of the i-th drawn frame and labels (n, 3)."""
 
-    def __init__(self, seed: int, frames: int, crops_per_frame: int) -> None:
+    def __init__(
+        self, seed: int, frames: int, crops_per_frame: int, encoding: AngleEncoding
+    ) -> None:
         self.seed, self.frames, self.crops_per_frame = seed, frames, crops_per_frame
+        self.encoding = encoding
 
     def __len__(self) -> int:
         return self.frames
@@ -41,7 +44,7 @@ class CropStream(Dataset[tuple[Tensor, Tensor]]):
         rng = np.random.default_rng((self.seed, i))
         drawn = draw_frame(rng)
         plan = plan_crops(FRAME_HW, CENTER_PX, rng, self.crops_per_frame)
-        labels = label_crops(plan, drawn.axis_rad)
+        labels = label_crops(plan, drawn.axis_rad, self.encoding)
         if drawn.elongation < LEAST_ELONGATION:
             labels[:, 1:] = 0.0
         return torch.from_numpy(cut_crops(drawn.image, plan)), torch.from_numpy(labels)

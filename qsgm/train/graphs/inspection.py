@@ -12,6 +12,7 @@ import onnx
 import onnxruntime as ort
 
 from qsgm.errors import QsgmError
+from qsgm.runtime import session_options
 
 PRODUCTS = frozenset({"Gemm", "MatMul", "Conv"})
 INTEGER_OPERATORS = frozenset({"QGemm", "QLinearConv", "QLinearMatMul", "MatMulIntegerToFloat"})
@@ -19,7 +20,7 @@ INTEGER_OPERATORS = frozenset({"QGemm", "QLinearConv", "QLinearMatMul", "MatMulI
 
 def optimized_nodes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
     """The nodes that ONNX Runtime runs, after its hardware-independent optimizations."""
-    options = ort.SessionOptions()
+    options = session_options()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
     with tempfile.TemporaryDirectory() as folder:
         options.optimized_model_filepath = str(Path(folder) / "optimized.onnx")

@@ -81,9 +81,14 @@ def int8_product(op: Ops, product: QuantizedProduct, x: Value) -> Value:
 
 
 def s8_plane(op: Ops, plane: NDArray[np.int8], scale: FloatArray) -> Value:
-    """Weights (O, I) with a scale per row, as the runtime wants to see them."""
-    no_offset = op.constant(np.zeros_like(plane[:, 0]), np.int8)
-    weight = op.constant(plane, np.int8)
+    """Weights (O, I) with a scale per row, as the runtime wants to see them.
+
+    Weights and zero points are not shared between planes, equal or not: where the runtime makes
+    them u8 (see :mod:`qsgm.runtime`) it refuses to convert the same constant twice.
+    """
+    name = f"{op.scope}/s8_plane_{len(op.graph.constants)}"
+    weight = op.graph.initializer(name, plane)
+    no_offset = op.graph.initializer(f"{name}_zero_point", np.zeros_like(plane[:, 0]))
     return op.DequantizeLinear(weight, op.constant(scale), no_offset, axis=0)
 
 

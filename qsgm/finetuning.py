@@ -10,15 +10,17 @@ method on it, so that methods can be compared on the very same crops.
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm import defaults
 from qsgm.angles import angle_error, decode_angle, mean_direction
 from qsgm.bundle import (
+    COMMAND,
     Bundle,
     Method,
     OptimizerName,
@@ -34,6 +36,7 @@ from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.errors import QsgmError
 from qsgm.fidelity import LayerFidelity, compare_probe, mean_over_run
 from qsgm.report import run_json
+from qsgm.runtime import running
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.tuning import BATCH, StepLoop, tune
 from qsgm.weights import to_conv_layout, to_step_layout
@@ -42,8 +45,6 @@ Array = NDArray[np.float32]
 # (stage, how much of it is done, out of how much)
 Watch = Callable[[str, int, int], None]
 
-DEFAULT_EPOCHS = 20
-DEFAULT_LAYERS = 3
 # Crops that are in memory at once.
 SLICE = 50
 DETECTION_THRESHOLD = 0.5
@@ -59,9 +60,9 @@ class Settings:
 
     method: Method = "sgm"
     precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
-    layers: int = DEFAULT_LAYERS  # how many of the last ones
+    layers: int = defaults.LAYERS  # how many of the last ones
     optimizer: OptimizerName | None = None
-    epochs: int = DEFAULT_EPOCHS
+    epochs: int = defaults.EPOCHS
     seed: int = 0
     center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
     threads: int = 1
@@ -231,7 +232,8 @@ def see(
         with _adding_to(seconds, "crops"):
             crops = cut_crops(frame, plan[rows])
         with _adding_to(seconds, "features"):
-            some = session.run(["features"], {"crops": crops})[0]
+            with running_graphs(bundle):
+                some = session.run(["features"], {"crops": crops})[0]
             if features is None:
                 features = np.empty((len(plan), *some.shape[1:]), np.float32)
             features[rows] = some
@@ -246,12 +248,13 @@ def answers(
     """Quality, sine and cosine (N, 3) that the tuned layers give with these weights."""
     session = bundle.session(head_file(settings.layers), settings.threads)
     slices = range(0, len(features), SLICE)
-    return np.concatenate(
-        [
-            session.run(["outputs"], {"features": features[i : i + SLICE], **weights})[0]
-            for i in slices
-        ]
-    )
+    with running_graphs(bundle):
+        return np.concatenate(
+            [
+                session.run(["outputs"], {"features": features[i : i + SLICE], **weights})[0]
+                for i in slices
+            ]
+        )
 
 
 def accuracy_of(
@@ -287,39 +290,11 @@ def train(
     if settings.method == "bp":
         settings = replace(settings, precision="float")
     recipe = bundle.recipe(settings.method, layers, settings.optimizer)
-    name = step_file(settings.method, settings.precision, recipe.optimizer, layers)
-    rates = dict(zip(tuned_layers(layers), recipe.rates, strict=True))
-    loop = _GuardedLoop(
-        bundle.session(name, settings.threads),
-        prepared.features,
-        prepared.labels,
-        prepared.start,
-        rates,
-    )
+    loop = _GuardedLoop(prepared, settings, recipe)
     prober = _Prober(prepared, settings, probe)
-    losses: list[float] = []
-
-    def after_epoch(epoch: int, loss: float) -> None:
-        losses.append(loss)
-        weights = loop.weights()
-        loop.refuse_unless_finite(all(np.isfinite(w).all() for w in weights.values()), "a weight")
-        prober(epoch, weights)
-        (watch or _ignore)("tuning", epoch, settings.epochs)
-
-    prober(0, prepared.start)
-    setup = time.perf_counter()
-    before = prober.seconds
-    # Methods with the same seed see the same batches in the same order.
-    tune(loop, TRAIN_CROPS, settings.epochs, np.random.default_rng([settings.seed, 1]), after_epoch)
-    tuning = time.perf_counter() - setup - (prober.seconds - before)
+    losses, tuning = _run_epochs(loop, prober, settings, watch or _ignore)
     weights = loop.weights()
-    validation = slice(TRAIN_CROPS, None)
-    accuracy = accuracy_of(
-        answers(prepared.features[validation], weights, bundle, settings),
-        prepared.labels[validation],
-        prepared.angle_rad[validation],
-        bundle,
-    )
+    accuracy = _validate(prepared, weights, settings)
     seconds = prepared.seconds | {"tuning": tuning, "probes": prober.seconds}
     seconds["total"] = prepared.seconds["total"] + time.perf_counter() - began
     result = FinetuneResult(
@@ -333,6 +308,38 @@ def train(
         seconds,
     )
     return replace(result, warnings=drift_warnings(result))
+
+
+def _run_epochs(
+    loop: "_GuardedLoop", prober: "_Prober", settings: Settings, watch: Watch
+) -> tuple[list[float], float]:
+    """Mean loss of every epoch, and the seconds that training took without the probes."""
+    losses: list[float] = []
+
+    def after_epoch(epoch: int, loss: float) -> None:
+        losses.append(loss)
+        weights = loop.weights()
+        loop.refuse_unless_finite(all(np.isfinite(w).all() for w in weights.values()), "a weight")
+        prober(epoch, weights)
+        watch("tuning", epoch, settings.epochs)
+
+    prober(0, loop.weights())
+    began, probing = time.perf_counter(), prober.seconds
+    # Methods with the same seed see the same batches in the same order.
+    tune(loop, TRAIN_CROPS, settings.epochs, np.random.default_rng([settings.seed, 1]), after_epoch)
+    return losses, time.perf_counter() - began - (prober.seconds - probing)
+
+
+def _validate(prepared: Prepared, weights: Mapping[str, Array], settings: Settings) -> Accuracy:
+    """On the crops that took no part in training."""
+    rows = slice(TRAIN_CROPS, None)
+    outputs = answers(prepared.features[rows], weights, prepared.bundle, settings)
+    return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
+
+
+def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:
+    """Around every run of a bundle's graph: they are checked when loaded, not for what they do."""
+    return running(f"the bundle {bundle.folder}", f"export it again with `{COMMAND}`")
 
 
 def drift_warnings(result: FinetuneResult) -> tuple[str, ...]:
@@ -362,10 +369,19 @@ def peak_activation_bytes(layers: int, batch: int = BATCH) -> dict[str, int]:
 class _GuardedLoop(StepLoop):
     """Stops at the first step that leaves the realm of numbers."""
 
-    steps = 0
+    def __init__(self, prepared: Prepared, settings: Settings, recipe: Recipe) -> None:
+        bundle, layers = prepared.bundle, settings.layers
+        name = step_file(settings.method, settings.precision, recipe.optimizer, layers)
+        session = bundle.session(name, settings.threads)
+        rates = dict(zip(tuned_layers(layers), recipe.rates, strict=True))
+        self.steps = 0
+        self._bundle = bundle
+        with running_graphs(bundle):
+            super().__init__(session, prepared.features, prepared.labels, prepared.start, rates)
 
     def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
-        loss = super().step(rows, factor)
+        with running_graphs(self._bundle):
+            loss = super().step(rows, factor)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
         return loss
@@ -387,6 +403,7 @@ class _Prober:
         self._layers = prepared.bundle.sgm_layers(settings.layers)
         self._rng = np.random.default_rng([settings.seed, 2])
         self._session = None
+        self._bundle = prepared.bundle
         name = probe_file(settings.layers)
         if wanted and self._layers and name in prepared.bundle.manifest["files"]:
             self._session = prepared.bundle.session(name, settings.threads)
@@ -399,7 +416,8 @@ class _Prober:
         began = time.perf_counter()
         rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
         names = [output.name for output in self._session.get_outputs()]
-        values = self._session.run(names, {**self._data, "rows": rows, **weights})
+        with running_graphs(self._bundle):
+            values = self._session.run(names, {**self._data, "rows": rows, **weights})
         outputs = dict(zip(names, values, strict=True))
         self.probes.append(Probe(epoch, compare_probe(outputs, self._layers)))
         self.seconds += time.perf_counter() - began

@@ -1,0 +1,18 @@
+"""Networks that nobody trained, for tests that ask whether two ways of computing them agree."""
+
+import torch
+
+from qsgm.train.graspnet import GraspNet
+
+
+def random_net(seed: int) -> GraspNet:
+    """Random weights, and batchnorms that are far from the identity."""
+    torch.manual_seed(seed)
+    net = GraspNet()
+    for layer in net.layers:
+        if layer.norm is not None:
+            layer.norm.running_mean.normal_()
+            layer.norm.running_var.uniform_(0.3, 3.0)
+            torch.nn.init.uniform_(layer.norm.weight, 0.5, 2.0)
+            torch.nn.init.normal_(layer.norm.bias)
+    return net.eval()

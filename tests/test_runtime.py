@@ -1,0 +1,45 @@
+"""Sessions: exact integer products on every CPU, and graphs that do not fit are refused."""
+
+import numpy as np
+import onnx
+import pytest
+
+from qsgm import QsgmError
+from qsgm.bundle import Bundle, step_file, trunk_file
+from qsgm.runtime import open_session, running
+from qsgm.train.graphs.inspection import integer_operators
+
+
+def test_products_of_u8_and_s8_are_exact_on_cpus_without_vnni(bundle: Bundle) -> None:
+    options = bundle.session(trunk_file(3)).get_session_options()
+    assert options.get_session_config_entry("session.x64quantprecision") == "1"
+
+
+def test_int8_sgms_run_as_integer_products_with_these_settings(bundle: Bundle) -> None:
+    model = onnx.load(bundle.folder / step_file("sgm", "int8", "sgd", 3))
+    assert set(integer_operators(model)) == {"QGemm"}
+
+
+def test_what_is_no_graph_is_refused_in_one_line() -> None:
+    with pytest.raises(QsgmError, match="cannot load a graph") as raised:
+        open_session(b"not a graph")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "feeds",
+    [
+        {},
+        {"crops": np.zeros((1, 128, 128, 4), np.uint8)},
+        {"crops": np.zeros((1, 128, 128, 3), np.float32)},
+        {"frame": np.zeros((1, 128, 128, 3), np.uint8)},
+    ],
+)
+def test_a_graph_that_does_not_fit_its_inputs_is_refused_in_one_line(
+    bundle: Bundle, feeds: dict[str, np.ndarray]
+) -> None:
+    session = bundle.session(trunk_file(3))
+    refused = pytest.raises(QsgmError, match=r"a graph of it does not fit .*; mend it")
+    with refused as raised, running("it", "mend it"):
+        session.run(None, feeds)
+    assert "\n" not in str(raised.value)
