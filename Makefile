@@ -51,5 +51,5 @@ clean:  ## remove environments, caches and the demo's output
 
 # Editable: only a change of the dependencies installs again.
 .venv-test/installed: .venv-test/bin/python pyproject.toml constraints.txt
-	.venv-test/bin/python $(PIP) --constraint constraints.txt --editable '.[train,report,dev]'
+	.venv-test/bin/python $(PIP) --constraint constraints.txt --editable '.[train,dev]'
 	touch $@

@@ -36,7 +36,7 @@ LARGEST_HIDDEN = 1024
 # UsageError; typer keeps it in another place in every other version.
 USAGE_ERROR = cast(type[Exception], typer.BadParameter.__base__)
 LARGEST_SEED = 2**31 - 1  # what numpy and torch take both
-HOST_LIBRARIES = ("torch", "onnx", "onnxscript")
+HOST_LIBRARIES = ("torch", "onnx")
 
 # (stage, done, of how many, values to show)
 Watch = Callable[..., None]

@@ -13,6 +13,7 @@ from qsgm.train import pretrain as module
 from qsgm.train.backbone import BackboneConfig
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.evaluate import Score
+from qsgm.train.graspnet import Loss
 from qsgm.train.maml import MamlConfig, MetaTraining
 from qsgm.train.matching import MatchingConfig
 from qsgm.train.partial import Partial
@@ -47,7 +48,7 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
     checkpoint = load_checkpoint(tmp_path / "sgm.pt")
     assert sorted(checkpoint.sgms) == [4, 5]
     assert {n: len(rates) for n, rates in checkpoint.rates.items()} == {1: 1, 2: 2, 3: 3}
-    assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3"
+    assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3 --hidden 8"
     assert list(dict.fromkeys(stages)) == ["backbone", "tasks", "matching", "meta", "rates"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
     assert (checkpoint.card["device"], checkpoint.card["resumed"]) == ("cpu", False)
@@ -155,10 +156,18 @@ def test_seconds_are_counted_over_interruptions(
     assert Partial.open(tmp_path / "x", {"seed": 1}).seconds == 0
 
 
-def test_the_card_names_a_device_that_is_not_the_default(tmp_path: Path) -> None:
+def test_the_command_on_the_card_says_every_option_that_is_not_the_default() -> None:
+    plain = module._command(0, "cpu", PretrainConfig(), Loss())
+    assert plain == "qsgm pretrain -o sgm.pt --seed 0"
+    other = module._command(3, "cuda", TINY, Loss("paper"))
+    assert other.removeprefix("qsgm pretrain -o sgm.pt --seed 3") == (
+        " --device cuda --encoding paper --hidden 8"
+    )
+
+
+def test_the_card_says_where_the_backbone_was_trained(tmp_path: Path) -> None:
     partial = Partial.open(tmp_path / "x", {})
-    card = module._card(3, "cuda", TINY, Score(0.0, 1.0, 2.0), partial)
-    assert card["command"] == "qsgm pretrain -o sgm.pt --seed 3 --device cuda"
+    card = module._card("qsgm pretrain", "cuda", TINY, Score(0.0, 1.0, 2.0), partial)
     assert "backbone on cuda" in module._card_text(tmp_path / "x", card)
 
 

@@ -94,7 +94,8 @@ def pretrain(
     net = _backbone(partial, config, loss, seed, device, watch)
     with one_thread():
         sgms, rates, score = _learn_to_tune(partial, net, config, loss, seed, watch)
-    card = _card(seed, device, config, score, partial)
+    command = _command(seed, device, config, loss)
+    card = _card(command, device, config, score, partial)
     checkpoint = Checkpoint(net, sgms, loss, rates, card)
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
@@ -314,12 +315,23 @@ def _refuse_unless_finite(stage: str, *modules: nn.Module) -> None:
             )
 
 
+def _command(seed: int, device: str, config: PretrainConfig, loss: Loss) -> str:
+    """What to type for the same checkpoint; options at their defaults are left out."""
+    hidden = ",".join(map(str, config.hidden))
+    options = {
+        "--device": (device, "cpu"),
+        "--encoding": (loss.encoding, Loss().encoding),
+        "--hidden": (hidden, ",".join(map(str, PretrainConfig().hidden))),
+    }
+    said = [f" {name} {value}" for name, (value, usual) in options.items() if value != usual]
+    return f"qsgm pretrain -o sgm.pt --seed {seed}{''.join(said)}"
+
+
 def _card(
-    seed: int, device: str, config: PretrainConfig, score: Score, partial: Partial
+    command: str, device: str, config: PretrainConfig, score: Score, partial: Partial
 ) -> dict[str, Any]:
-    on_device = "" if device == "cpu" else f" --device {device}"
     return {
-        "command": f"qsgm pretrain -o sgm.pt --seed {seed}{on_device}",
+        "command": command,
         "qsgm": qsgm.__version__,
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} thread(s)",
