@@ -2,7 +2,7 @@
 
 Six convolutions, each but the last with batchnorm and ReLU; 5x5 average pooling after the fourth.
 A 128x128 crop gives one output, a 480x640 frame a heatmap of 23x33: the same network, fully
-convolutional. The pool's kind is not stated in the paper; averaging was measured to be better.
+convolutional. The pool's kind is not stated in the paper; this one averages.
 """
 
 from dataclasses import dataclass
