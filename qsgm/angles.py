@@ -2,7 +2,7 @@
 
 A two-finger gripper cannot tell an angle from its opposite, so an angle is a line's direction.
 The double angle (sin 2θ, cos 2θ) has no seam anywhere; the paper's (sin θ, cos θ) with
-θ in (-π/2, π/2] breaks at ±90° (design finding 2) and is kept for the paper's tables.
+θ in (-π/2, π/2] breaks at ±90° and is kept for the paper's tables.
 """
 
 from typing import Literal, get_args

@@ -1,10 +1,10 @@
 """One demonstration frame becomes 1000 labelled crops (paper section 3.1, "Dataset").
 
 Positives show the object at the crop's centre under every rotation; negatives are near misses
-and windows from anywhere in the frame (design finding 9: without those, detections land on the
-far background). Every crop has its own colours. What is drawn at random is drawn first, as a
-:class:`CropPlan`; cutting is then deterministic and can go in slices, so that all crops never
-have to be in memory together.
+and windows from anywhere in the frame, without which detections land on the far background.
+Every crop has its own colours. What is drawn at random is drawn first, as a :class:`CropPlan`;
+cutting is then deterministic and can go in slices, so that all crops never have to be in memory
+together.
 """
 
 from dataclasses import dataclass
@@ -111,8 +111,8 @@ def label_crops(
 ) -> NDArray[np.float32]:
     """Labels (N, 3) of the planned crops: quality, sine and cosine; zeros for negatives.
 
-    `offset_rad` is the demonstration's own orientation as the network sees it
-    (design finding 3), so that angles mean the same for every object.
+    `offset_rad` is the demonstration's own orientation as the network sees it,
+    so that angles mean the same for every object.
     """
     angle = encode_angle(plan.turn_rad + offset_rad, encoding)
     return np.concatenate([plan.quality[:, None], angle * plan.quality[:, None]], axis=1)

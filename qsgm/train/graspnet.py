@@ -19,7 +19,7 @@ KERNELS = (5, 5, 5, 5, 1, 1)
 STRIDES = (2, 2, 2, 2, 1, 1)
 POOL_AFTER_LAYER = 4
 POOL = 5
-# Keeps logits bounded, and with them the gradients' tails (design finding 6).
+# Keeps logits bounded, and with them the gradients' tails.
 LABEL_SMOOTHING = 0.05
 ANGLE_WEIGHT = 1.0
 

@@ -1,8 +1,8 @@
 """Pretraining, second stage: SGMs regress true gradients along backpropagation runs.
 
 Supervised and quick. Alone it is not enough: errors that do not average out lead the tuned layers
-where no backpropagation run went (design finding 4), which the third stage, MAML, repairs. Started
-from random SGMs instead, that one needs many times longer.
+where no backpropagation run went, which the third stage, MAML, repairs. Started from random SGMs
+instead, that one mostly meets runs that blew up.
 """
 
 from collections.abc import Callable, Sequence

@@ -40,7 +40,7 @@ from qsgm.train.tasks import TaskSet, draw_tasks, start_states
 
 TUNED = 3
 # Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
-# for its SGM to know what they do (design findings 5 and 7).
+# for its SGM to know what they do.
 FIRST_RATES = (6e-3, 1e-3, 3e-3)
 RATE_GRID = (3e-3, 1e-2, 3e-2, 1e-1)
 # Meta-training's rates are constant, the device's decay: they may start higher.

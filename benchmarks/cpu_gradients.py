@@ -1,0 +1,63 @@
+"""The shipped int8 SGMs' gradients on this CPU, to be compared with those of another.
+
+    python benchmarks/cpu_gradients.py native.npz
+    python benchmarks/cpu_gradients.py --compare native.npz other.npz
+
+Each file holds the gradients with this project's session settings, and with the one against
+saturation left out. Inputs are random, from a fixed seed.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from qsgm.bundle import load_bundle, probe_file
+from qsgm.fidelity import cosine
+from qsgm.paths import bundle_folder
+from qsgm.runtime import session_options
+from qsgm.weights import to_step_layout
+
+CROPS, TUNED = 64, 3
+SATURATION = "session.x64quantprecision"
+
+
+def gradients(exact: str) -> dict[str, np.ndarray]:
+    """Gradients by SGM layer, with the setting against saturation on (`1`) or off (`0`)."""
+    bundle = load_bundle(bundle_folder())
+    options = session_options()
+    options.add_session_config_entry(SATURATION, exact)
+    session = ort.InferenceSession(
+        str(bundle.folder / probe_file(TUNED)), options, providers=["CPUExecutionProvider"]
+    )
+    rng = np.random.default_rng(0)
+    labels = np.zeros((CROPS, 3), np.float32)
+    labels[::2] = 1.0, 0.6, 0.8
+    feeds = {
+        "features": np.abs(rng.normal(size=(CROPS, 169, 16))).astype(np.float32),
+        "labels": labels,
+        "rows": np.arange(CROPS),
+    }
+    for name, value in bundle.start_weights(TUNED).items():
+        feeds[name] = to_step_layout(value) if value.ndim > 1 else value
+    names = [f"int8{layer}" for layer in bundle.sgm_layers(TUNED)]
+    return {
+        f"{name} exact={exact}": value
+        for name, value in zip(names, session.run(names, feeds), strict=True)
+    }
+
+
+def compare(one: Path, other: Path) -> None:
+    """Print, for every gradient, whether both files agree to the bit, and the cosine."""
+    with np.load(one) as first, np.load(other) as second:
+        for name in first.files:
+            same = np.array_equal(first[name], second[name])
+            print(f"{name}: bit-equal {same}, cosine {cosine(first[name], second[name]):.5f}")
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--compare":
+        compare(Path(sys.argv[2]), Path(sys.argv[3]))
+    else:
+        np.savez(sys.argv[1], **gradients("1"), **gradients("0"))
