@@ -9,8 +9,16 @@ from qsgm.train.graspnet import Loss
 from qsgm.train.local import LayerState, local_step, loss_gradient, outputs, true_gradients
 
 TASKS, BATCH = 3, 5
-SHAPES = {4: (16, 16, 5, 5), 5: (16, 16, 1, 1), 6: (3, 16, 1, 1)}
-RATES = {4: 0.1, 5: 0.2, 6: 0.3}
+SHAPES = {
+    1: (8, 3, 5, 5),
+    2: (8, 8, 5, 5),
+    3: (16, 8, 5, 5),
+    4: (16, 16, 5, 5),
+    5: (16, 16, 1, 1),
+    6: (3, 16, 1, 1),
+}
+SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees of a crop
+RATES = {1: 0.01, 2: 0.02, 3: 0.03, 4: 0.1, 5: 0.2, 6: 0.3}
 LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=2.0)]
 
 Weights = dict[int, tuple[Tensor, Tensor]]  # per layer: (Co, Ci, kh, kw) and (Co,)
@@ -30,7 +38,8 @@ def random_weights(tuned: int) -> list[Weights]:
 
 
 def random_data(tuned: int) -> tuple[Tensor, Tensor]:
-    features = torch.randn(TASKS, BATCH, 169 if tuned == 3 else 1, 16).relu()
+    first = 7 - tuned
+    features = torch.randn(TASKS, BATCH, SIDE[first] ** 2, SHAPES[first][1]).relu()
     angle = torch.randn(TASKS, BATCH)
     quality = (angle > -0.5).float()
     return features, torch.stack([quality, angle.sin(), angle.cos()], dim=-1)
@@ -47,7 +56,7 @@ def as_states(tasks: list[Weights]) -> list[LayerState]:
 
 
 def plain_layer(number: int, weights: Weights, x: Tensor) -> Tensor:
-    x = F.conv2d(x, *weights[number], stride=2 if number == 4 else 1)
+    x = F.conv2d(x, *weights[number], stride=2 if number <= 4 else 1)
     x = F.relu(x) if number < 6 else x
     return F.avg_pool2d(x, 5) if number == 4 else x
 
@@ -67,7 +76,7 @@ def flat_gradients(number: int, weights: Weights, objective: Tensor) -> tuple[Te
     return weight.permute(2, 3, 1, 0).flatten(0, 2), bias
 
 
-@pytest.mark.parametrize("tuned", [1, 2, 3])
+@pytest.mark.parametrize("tuned", range(1, 7))
 def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> None:
     tasks, (features, labels) = random_weights(tuned), random_data(tuned)
     states = as_states(tasks)
@@ -90,9 +99,9 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
             if number == 6:
                 objective = loss(x.flatten(1), labels[task])
             else:
-                after = x.detach().flatten(1)[:, None]
-                injected = made_up_gradient(number, after, labels[task])[:, 0]
-                objective = (x.flatten(1) * injected).sum() / BATCH
+                after = x.flatten(2).transpose(1, 2)
+                injected = made_up_gradient(number, after.detach(), labels[task])
+                objective = (after * injected).sum() / BATCH
             weight, bias = flat_gradients(number, weights, objective)
             before, once = states[index], updated[index]
             moved = before.weight[task] - RATES[number] * weight
@@ -105,7 +114,7 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
             torch.testing.assert_close(twice[index].weight, moved)
 
 
-@pytest.mark.parametrize("tuned", [1, 2, 3])
+@pytest.mark.parametrize("tuned", range(1, 7))
 def test_outputs_equal_plain_convolutions(tuned: int) -> None:
     tasks, (features, _) = random_weights(tuned), random_data(tuned)
     got = outputs(as_states(tasks), features)
@@ -125,7 +134,7 @@ def test_loss_gradient_equals_autograd(loss: Loss) -> None:
     torch.testing.assert_close(loss_gradient(loss, raw.detach(), labels), expected)
 
 
-@pytest.mark.parametrize("tuned", [1, 2, 3])
+@pytest.mark.parametrize("tuned", range(1, 7))
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
 def test_true_gradients_equal_autograd(tuned: int, loss: Loss) -> None:
     tasks, (features, labels) = random_weights(tuned), random_data(tuned)
@@ -138,8 +147,8 @@ def test_true_gradients_equal_autograd(tuned: int, loss: Loss) -> None:
         total = loss.per_sample(x.flatten(1), labels[task]).sum()
         expected = torch.autograd.grad(total, list(activations.values()))
         for number, gradient in zip(activations, expected, strict=True):
-            flat = got[number][task, :, 0]
-            torch.testing.assert_close(flat, gradient.flatten(1), atol=1e-5, rtol=1e-5)
+            rows = gradient.flatten(2).transpose(1, 2)
+            torch.testing.assert_close(got[number][task], rows, atol=1e-5, rtol=1e-5)
 
 
 def test_meta_gradients_flow_through_a_step() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from qsgm.train.graspnet import KERNELS, LAYERS, POOL_AFTER_LAYER, STRIDES, Loss
 
@@ -155,16 +156,29 @@ def true_gradients(
     states: Sequence[LayerState], features: Tensor, labels: Tensor, loss: Loss
 ) -> dict[int, Tensor]:
     """Per-sample gradients on every tuned layer's activation by backpropagation, written out."""
-    befores, x = {}, features
+    inputs, befores, x = {}, {}, features
     for layer, state in zip(_numbers(states), states, strict=True):
+        inputs[layer] = x
         befores[layer], x = layer_forward(layer, state, columns(layer, x))
     gradients = {LAYERS: loss_gradient(loss, x, labels[:, :, None])}
     for layer, state in list(zip(_numbers(states), states, strict=True))[:0:-1]:
         dz = through_activation(layer, befores[layer], gradients[layer])
-        if KERNELS[layer - 1] != 1:
-            raise NotImplementedError(f"layer {layer}: only 1x1 layers are carried back here")
-        gradients[layer - 1] = dz @ state.weight.transpose(1, 2)[:, None]
+        d_columns = dz @ state.weight.transpose(1, 2)[:, None]
+        gradients[layer - 1] = sum_windows(layer, d_columns, inputs[layer].shape[2])
     return gradients
+
+
+def sum_windows(layer: int, windows: Tensor, positions: int) -> Tensor:
+    """The transpose of :func:`columns`: windows (T, B, P_out, K) added up where they overlap.
+
+    Returns (T, B, P, C_in) with P = `positions`, a square map.
+    """
+    kernel, side = KERNELS[layer - 1], round(positions**0.5)
+    if kernel == 1:
+        return windows
+    by_channel = windows.unflatten(3, (kernel * kernel, -1)).flatten(0, 1).permute(0, 3, 2, 1)
+    maps = F.fold(by_channel.flatten(1, 2), (side, side), kernel, stride=STRIDES[layer - 1])
+    return maps.flatten(2).transpose(1, 2).unflatten(0, windows.shape[:2])
 
 
 def _numbers(states: Sequence[LayerState]) -> range:
