@@ -178,8 +178,8 @@ def sum_windows(layer: int, windows: Tensor, positions: int) -> Tensor:
         return windows
     by_channel = windows.unflatten(3, (kernel * kernel, -1)).flatten(0, 1).permute(0, 3, 2, 1)
     channels_first = by_channel.flatten(1, 2)
-    maps: Tensor = F.fold(channels_first, (side, side), kernel, stride=STRIDES[layer - 1])
-    return maps.flatten(2).transpose(1, 2).unflatten(0, windows.shape[:2])
+    maps = F.fold(channels_first, (side, side), kernel, stride=STRIDES[layer - 1])
+    return maps.flatten(2).transpose(1, 2).reshape(*windows.shape[:2], positions, -1)
 
 
 def _numbers(states: Sequence[LayerState]) -> range:
