@@ -1,25 +1,35 @@
 """The benchmarks: scenes whose truth is known, folders read right, reports that add up."""
 
+import io
 import json
 import math
+from dataclasses import astuple, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 from qsgm import QsgmError, cli
-from qsgm.bench.accuracy import measure_accuracy, statistics
+from qsgm.bench import accuracy
+from qsgm.bench.accuracy import ANGLE, AccuracyReport, curve_steps, measure_accuracy
+from qsgm.bench.accuracy_report import accuracy_report_json, render, statistics
 from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bench.scenes import ON_OBJECT_PX, SceneResult, ScenesReport
 from qsgm.bench.speed import measure_speed, ratios
 from qsgm.bench.staging import BORDER_PX, CutOut, Scene, cut_out, make_scenes, put_down
-from qsgm.bundle import Bundle
-from qsgm.finetuning import Settings, finetune
+from qsgm.blocks import single_layers
+from qsgm.bundle import Bundle, Recipe, step_file
+from qsgm.finetuning import Settings, finetune, prepare, train
 from qsgm.images import write_png
 from qsgm.predict import Detection
+from qsgm.tuning import StepLoop, batches
 
 SHORT = Settings(epochs=1)
+MAIN = Settings(epochs=2)
 CENTER = (320.0, 240.0)
 
 
@@ -173,21 +183,147 @@ def test_turns_of_round_objects_do_not_count(bundle: Bundle) -> None:
     assert report.summary()["median_turn_error_deg"] is None
 
 
-def test_accuracy_is_measured_for_every_method_on_the_same_crops(
-    frames_folder: Path, bundle: Bundle
-) -> None:
+@pytest.fixture(scope="module")
+def accuracy_report(frames_folder: Path, bundle: Bundle) -> AccuracyReport:
+    """Runs of one and two epochs on a bar and a disk, with a small grid whose last rate blows up.
+
+    Of the short lengths asked for, those that are not below the main one are left out.
+    """
     told: list[tuple[str, int, int]] = []
-    frames = list_frames(frames_folder)
-    report = measure_accuracy(frames, bundle, SHORT, lambda *what: told.append(what))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accuracy, "GRID", {"adam": (0.001, 0.003), "sgd": (0.01, 1e12)})
+        report = measure_accuracy(
+            list_frames(frames_folder), bundle, MAIN, (5, 1, 2), lambda *what: told.append(what)
+        )
     assert told == [("frames", 1, 2), ("frames", 2, 2)]
-    methods = ["untouched", "sgm int8", "sgm float", "bp sgd", "bp adam"]
-    assert list(report.frames[0].accuracy) == methods
-    alone = finetune(frames[0].read(), bundle, SHORT)
-    assert report.frames[0].accuracy["sgm int8"] == alone.accuracy
-    assert report.frames[0].accuracy["untouched"] == alone.zero_shot
-    values = report.to_json()
-    assert (values["all"]["frames"], values["elongated"]["frames"]) == (2, 1)
+    return report
+
+
+def ends_of(report: AccuracyReport, metric: int = ANGLE) -> list[dict[Recipe, float]]:
+    """Per run length: the mean of a metric over the judged frames, for all of the grid."""
+    places = report.groups[report.judged]
+    return [
+        {recipe: float(curves[places, -1, metric].mean()) for recipe, curves in runs.grid.items()}
+        for runs in report.runs
+    ]
+
+
+def test_accuracy_is_measured_for_every_run_length_and_method(
+    accuracy_report: AccuracyReport,
+) -> None:
+    assert [(runs.epochs, runs.steps[-1]) for runs in accuracy_report.runs] == [(1, 25), (2, 50)]
+    methods = ["untouched", "sgm int8", "sgm float", "bp sgd", "bp adam", "bp best"]
+    for runs in accuracy_report.runs:
+        assert list(runs.methods) == methods
+        shapes = {curves.shape for curves in (*runs.methods.values(), *runs.grid.values())}
+        assert shapes == {(2, len(runs.steps), 2)}
+        for name in methods[:-1]:
+            assert np.isfinite(runs.methods[name]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("sgm int8", {}),
+        ("sgm float", {"precision": "float"}),
+        ("bp sgd", {"method": "bp", "optimizer": "sgd"}),
+        ("bp adam", {"method": "bp", "optimizer": "adam"}),
+    ],
+)
+def test_a_learning_curve_goes_from_the_untouched_network_to_what_finetune_gives(
+    accuracy_report: AccuracyReport, bundle: Bundle, name: str, changes: dict[str, Any]
+) -> None:
+    frame = accuracy_report.frames[0].read()
+    for runs in accuracy_report.runs:
+        alone = finetune(frame, bundle, replace(MAIN, epochs=runs.epochs, **changes))
+        curve = runs.methods[name][0]
+        assert tuple(curve[0]) == astuple(alone.zero_shot)
+        assert tuple(curve[-1]) == astuple(alone.accuracy)
+        np.testing.assert_array_equal(runs.methods["untouched"][0], curve[:1].repeat(len(curve), 0))
+
+
+def test_weights_on_the_way_are_those_of_a_run_cut_short_there(
+    frame_path: Path, bundle: Bundle
+) -> None:
+    prepared = prepare(BenchFrame(frame_path, None, None).read(), bundle, MAIN)
+    recipe = Recipe("sgd", (0.003, 0.004, 0.005))
+    result = train(prepared, MAIN, recipe=recipe, keep=(0, 7))
+    session = bundle.session(step_file("int8", "sgd", single_layers(3)))
+    rates = dict(zip((4, 5, 6), recipe.rates, strict=True))
+    loop = StepLoop(session, prepared.features, prepared.labels, prepared.start, rates)
+    for step, rows in enumerate(islice(batches(800, np.random.default_rng([0, 1])), 7)):
+        loop.step(rows, 1 - step / 50)
+    assert set(result.kept) == {0, 7}
+    for name, value in loop.weights().items():
+        np.testing.assert_array_equal(result.kept[7][name], value)
+        np.testing.assert_array_equal(result.kept[0][name], prepared.start[name])
+
+
+def test_a_run_is_looked_at_twice_a_doubling_and_at_both_ends() -> None:
+    assert curve_steps(0) == (0,)
+    assert curve_steps(1) == (0, 1, 2, 3, 4, 6, 8, 11, 16, 23, 25)
+    assert curve_steps(20)[-5:] == (128, 181, 256, 362, 500)
+
+
+def test_the_best_backpropagation_is_not_worse_than_any_of_the_grid(
+    accuracy_report: AccuracyReport,
+) -> None:
+    assert accuracy_report.judged == "elongated"
+    for runs, errors in zip(accuracy_report.runs, ends_of(accuracy_report), strict=True):
+        assert len(errors) == 4
+        assert errors[runs.best] == min(error for error in errors.values() if error == error)
+        np.testing.assert_array_equal(runs.methods["bp best"], runs.grid[runs.best])
+
+
+def test_rates_that_blow_up_are_reported_and_never_the_best(
+    accuracy_report: AccuracyReport,
+) -> None:
+    for runs, errors in zip(accuracy_report.runs, ends_of(accuracy_report), strict=True):
+        assert math.isnan(errors[Recipe("sgd", (1e12,) * 3)])
+        assert runs.best.rates[0] < 1
+    grid = accuracy_report_json(accuracy_report)["runs"][0]["grid"]
+    assert [(entry["optimizer"], entry["rate"]) for entry in grid] == [
+        *(("adam", rate) for rate in (0.001, 0.003)),
+        *(("sgd", rate) for rate in (0.01, 1e12)),
+    ]
+    assert grid[-1]["elongated"] == {"detection_accuracy": None, "angle_mae_deg": None}
+    assert grid[0]["all"]["angle_mae_deg"] > 0
+
+
+def test_the_accuracy_report_adds_up(accuracy_report: AccuracyReport) -> None:
+    values = accuracy_report_json(accuracy_report)
     json.dumps(values, allow_nan=False)
+    assert (values["all"]["frames"], values["elongated"]["frames"]) == (2, 1)
+    main = values["runs"][-1]
+    assert values["elongated"]["methods"] == main["elongated"]
+    bar, disk = values["per_frame"]
+    for runs in values["runs"]:
+        of_length = [frame["runs"][str(runs["epochs"])] for frame in (bar, disk)]
+        for name, metrics in runs["all"].items():
+            for metric, found in metrics.items():
+                both = [methods[name][metric] for methods in of_length]
+                assert found["mean"] == pytest.approx(np.mean(both), abs=1e-4)
+                curve = runs["curves"]["methods"][name][metric]
+                assert curve["mean"][-1] == curve["upper_quartile"][-1] == both[0]
+        best = runs["elongated"]["bp best"]["angle_mae_deg"]["mean"]
+        ours = runs["elongated"]["sgm int8"]["angle_mae_deg"]["mean"]
+        ratio = runs["sgm_int8_over_bp_best"]["elongated"]["angle_mae_deg"]
+        assert ratio == pytest.approx(ours / best, abs=1e-3)
+    assert bar["methods"] == bar["runs"]["2"]
+
+
+def test_the_tables_of_the_defaults_fit_into_80_columns(accuracy_report: AccuracyReport) -> None:
+    one, main = accuracy_report.runs
+    lengths = (one, replace(one, epochs=3), replace(main, epochs=20))
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(render(replace(accuracy_report, runs=lengths), per_frame=True))
+    lines = [line.rstrip() for line in console.export_text().splitlines()]
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if line.startswith(" sgm int8")]
+    assert len(rows) == 2  # all, elongated
+    ends = [runs.methods["sgm int8"][0, -1] for runs in lengths]
+    means = [f"{end[metric]:.{3 - metric}f}" for end in ends for metric in (0, 1)]
+    assert rows[1][2:8] == means
 
 
 def test_statistics_are_mean_median_spread_and_both_ends() -> None:
@@ -213,6 +349,17 @@ def test_bench_accuracy_and_scenes_run_from_the_command_line(
     assert cli.run(["bench", "scenes", *common, "--scenes", "1", "-o", str(pictures)]) == 0
     assert "detected on the empty table" in capsys.readouterr().out
     assert len(list(pictures.glob("*.png"))) == 4
+
+
+@pytest.mark.parametrize("lengths", ["1,", "1;3", "0", "-1,3", "x"])
+def test_run_lengths_that_are_no_numbers_of_epochs_are_refused(
+    frames_folder: Path, lengths: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["bench", "accuracy", "--frames", str(frames_folder), "--short", lengths]
+    assert cli.run(command) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "--short" in message
 
 
 def test_ratios_compare_tuning_with_forward_passes() -> None:

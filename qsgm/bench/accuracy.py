@@ -1,35 +1,56 @@
-"""Detection and angle error of every method, on the same crops of the same frames."""
+"""Detection and angle error of every method and run length, on the same crops of the same frames.
+
+Every run is followed on the way: its learning curve starts at the untouched network and ends at
+the tuned one.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from rich.console import Group, RenderableType
-from rich.text import Text
+from numpy.typing import NDArray
 
 from qsgm.bench.frames import BenchFrame
-from qsgm.bundle import Bundle
-from qsgm.finetuning import Accuracy, Settings, Watch, prepare, train
-from qsgm.report import accuracy_json, number, plain_table
+from qsgm.bundle import Bundle, Method, OptimizerName, Precision, Recipe
+from qsgm.crops import TRAIN_CROPS
+from qsgm.errors import QsgmError
+from qsgm.finetuning import Prepared, Settings, Watch, prepare, train, validate
+from qsgm.tuning import BATCH
 
-UNTOUCHED = "untouched"
-# Each method with its own recipe; backpropagation with both optimizers.
-METHODS: Mapping[str, dict[str, Any]] = {
-    "sgm int8": {"method": "sgm", "precision": "int8"},
-    "sgm float": {"method": "sgm", "precision": "float"},
-    "bp sgd": {"method": "bp", "precision": "float", "optimizer": "sgd"},
-    "bp adam": {"method": "bp", "precision": "float", "optimizer": "adam"},
-}
+Floats = NDArray[np.float64]
+
 METRICS = ("detection_accuracy", "angle_mae_deg")
+DETECTION, ANGLE = range(len(METRICS))
+UNTOUCHED, SGM_INT8, BP_BEST = "untouched", "sgm int8", "bp best"
+# What `bp best` is chosen from; one rate for all layers, momentum 0.9 for SGD.
+GRID: Mapping[OptimizerName, tuple[float, ...]] = {
+    "sgd": (0.003, 0.01, 0.02, 0.03),
+    "adam": (0.0003, 0.001, 0.002, 0.003),
+}
 
 
 @dataclass(frozen=True)
-class FrameAccuracy:
-    """One frame's results by method, the untouched network first."""
+class Variant:
+    """One way to tune."""
 
-    frame: BenchFrame
-    accuracy: dict[str, Accuracy]
+    method: Method
+    precision: Precision
+    recipe: Recipe
+
+
+# One frame's learning curves: (steps, METRICS).
+Curves = dict[Variant, Floats]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """All runs of one length, on all frames; each array is (frames, steps, `METRICS`)."""
+
+    epochs: int
+    steps: tuple[int, ...]  # 0 is the untouched network, the last one the end of the run
+    methods: dict[str, Floats]  # by name, the untouched network first and `bp best` last
+    grid: dict[Recipe, Floats]  # of backpropagation; a run that diverged is all NaN
+    best: Recipe  # the one of the grid that is `bp best`
 
 
 @dataclass(frozen=True)
@@ -38,113 +59,140 @@ class AccuracyReport:
 
     settings: Settings
     bundle: Bundle
-    frames: tuple[FrameAccuracy, ...]
+    frames: tuple[BenchFrame, ...]
+    groups: dict[str, list[int]]  # of frames, by place; see `groups_of`
+    runs: tuple[Runs, ...]  # by length, the main one last
 
-    def groups(self) -> dict[str, list[FrameAccuracy]]:
-        """All frames and, where a manifest says which they are, the elongated ones."""
-        elongated = [frame for frame in self.frames if frame.frame.elongated]
-        groups = {"all": list(self.frames)}
-        return groups | {"elongated": elongated} if elongated else groups
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "bundle": str(self.bundle.folder),
-            "layers": self.settings.layers,
-            "epochs": self.settings.epochs,
-            "seed": self.settings.seed,
-            **{
-                group: {"frames": len(frames), "methods": summary(frames)}
-                for group, frames in self.groups().items()
-            },
-            "per_frame": [
-                {
-                    "frame": one.frame.name,
-                    "elongated": one.frame.elongated,
-                    "methods": {name: accuracy_json(a) for name, a in one.accuracy.items()},
-                }
-                for one in self.frames
-            ],
-        }
-
-    def render(self, per_frame: bool) -> RenderableType:
-        """Tables of every group and, if asked for, of every frame."""
-        parts: list[RenderableType] = [
-            summary_table(group, frames) for group, frames in self.groups().items()
-        ]
-        parts.append(Text("angle error in degrees, modulo 180°; spread: standard deviation"))
-        return Group(*parts, per_frame_table(self.frames)) if per_frame else Group(*parts)
+    @property
+    def judged(self) -> str:
+        """The group that `bp best` was chosen on: the elongated frames where they are known."""
+        return list(self.groups)[-1]
 
 
 def measure_accuracy(
-    frames: Sequence[BenchFrame], bundle: Bundle, settings: Settings, watch: Watch
+    frames: Sequence[BenchFrame],
+    bundle: Bundle,
+    settings: Settings,
+    short: Sequence[int],
+    watch: Watch,
 ) -> AccuracyReport:
-    """Tune on every frame by every method; crops and features are shared between methods."""
-    results = []
+    """Tune on every frame by every method; crops and features are shared between all runs.
+
+    Args:
+        frames: to tune on, one by one.
+        bundle: to tune.
+        settings: its epochs are the main run length; method, precision and optimizer do not matter.
+        short: epochs of further runs; those that are not below the main length are left out.
+        watch: told about every frame.
+
+    Raises:
+        QsgmError: a frame cannot be read, or training diverged with the bundle's own rates.
+    """
+    lengths = (*sorted({epochs for epochs in short if epochs < settings.epochs}), settings.epochs)
+    methods, grid = own_methods(bundle, settings.layers), bp_grid(settings.layers)
+    curves: list[dict[int, Curves]] = []
     for done, frame in enumerate(frames, start=1):
-        results.append(FrameAccuracy(frame, measure_frame(frame, bundle, settings)))
+        prepared = prepare(frame.read(), bundle, settings)
+        curves.append(
+            {
+                epochs: measure_runs(prepared, replace(settings, epochs=epochs), methods, grid)
+                for epochs in lengths
+            }
+        )
         watch("frames", done, len(frames))
-    return AccuracyReport(settings, bundle, tuple(results))
+    groups = groups_of(frames)
+    judged = list(groups.values())[-1]
+    runs = [
+        gather(epochs, [of_frame[epochs] for of_frame in curves], methods, grid, judged)
+        for epochs in lengths
+    ]
+    return AccuracyReport(settings, bundle, tuple(frames), groups, tuple(runs))
 
 
-def measure_frame(frame: BenchFrame, bundle: Bundle, settings: Settings) -> dict[str, Accuracy]:
-    """One frame's accuracy by method."""
-    prepared = prepare(frame.read(), bundle, settings)
-    accuracy = {UNTOUCHED: prepared.zero_shot}
-    for name, changes in METHODS.items():
-        accuracy[name] = train(prepared, replace(settings, **changes), probe=False).accuracy
-    return accuracy
-
-
-def summary(frames: Sequence[FrameAccuracy]) -> dict[str, Any]:
-    """Mean, median and spread (standard deviation) of every metric, by method."""
+def own_methods(bundle: Bundle, layers: int) -> dict[str, Variant]:
+    """Each method with the bundle's recipe; backpropagation with both optimizers."""
+    sgm = bundle.recipe("sgm", layers, None)
     return {
-        name: {metric: statistics(values_of(frames, name, metric)) for metric in METRICS}
-        for name in frames[0].accuracy
+        SGM_INT8: Variant("sgm", "int8", sgm),
+        "sgm float": Variant("sgm", "float", sgm),
+        "bp sgd": Variant("bp", "float", bundle.recipe("bp", layers, "sgd")),
+        "bp adam": Variant("bp", "float", bundle.recipe("bp", layers, "adam")),
     }
 
 
-def statistics(values: Sequence[float]) -> dict[str, float | None]:
-    """Mean, median, standard deviation and both ends."""
-    return {
-        "mean": number(float(np.mean(values)), 4),
-        "median": number(float(np.median(values)), 4),
-        "spread": number(float(np.std(values)), 4),
-        "min": number(min(values), 4),
-        "max": number(max(values), 4),
-    }
+def bp_grid(layers: int) -> list[Variant]:
+    """Backpropagation with every optimizer and rate of the grid."""
+    return [
+        Variant("bp", "float", Recipe(optimizer, (rate,) * layers))
+        for optimizer, rates in GRID.items()
+        for rate in rates
+    ]
 
 
-def values_of(frames: Sequence[FrameAccuracy], name: str, metric: str) -> list[float]:
-    """One metric of one method on every frame."""
-    return [float(getattr(frame.accuracy[name], metric)) for frame in frames]
+def groups_of(frames: Sequence[BenchFrame]) -> dict[str, list[int]]:
+    """Places of all frames and, where a manifest says which they are, of the elongated ones."""
+    elongated = [i for i, frame in enumerate(frames) if frame.elongated]
+    groups = {"all": list(range(len(frames)))}
+    return groups | {"elongated": elongated} if elongated else groups
 
 
-def summary_table(group: str, frames: Sequence[FrameAccuracy]) -> RenderableType:
-    """One row per method."""
-    table = plain_table(f"{group}: {len(frames)} frames")
-    table.add_column("method")
-    for metric in ("detection", "angle"):
-        for statistic in ("mean", "median", "spread"):
-            table.add_column(f"{metric}\n{statistic}", justify="right")
-    for name in frames[0].accuracy:
-        cells = []
-        for metric, form in zip(METRICS, ("{:.3f}", "{:.2f}"), strict=True):
-            values = values_of(frames, name, metric)
-            cells += [form.format(f(values)) for f in (np.mean, np.median, np.std)]
-        table.add_row(name, *cells)
-    return table
+def measure_runs(
+    prepared: Prepared,
+    settings: Settings,
+    methods: Mapping[str, Variant],
+    grid: Sequence[Variant],
+) -> Curves:
+    """One frame's learning curves of one length; no run is made twice."""
+    curves = {variant: learning_curve(prepared, settings, variant) for variant in methods.values()}
+    for variant in grid:
+        if variant in curves:
+            continue
+        try:
+            curves[variant] = learning_curve(prepared, settings, variant)
+        except QsgmError:  # diverged, as high rates may: it is then not the best
+            curves[variant] = np.full((len(curve_steps(settings.epochs)), len(METRICS)), np.nan)
+    return curves
 
 
-def per_frame_table(frames: Sequence[FrameAccuracy]) -> RenderableType:
-    """One row per frame: detection and angle error of every method."""
-    table = plain_table("per frame: detection, angle error")
-    table.padding = (0, 1, 0, 0)
-    table.add_column("frame", no_wrap=True, max_width=19)
-    for name in frames[0].accuracy:
-        table.add_column(name, justify="right", no_wrap=True, min_width=9)
-    for frame in frames:
-        cells = [
-            f"{a.detection_accuracy:.2f} {a.angle_mae_deg:4.1f}" for a in frame.accuracy.values()
-        ]
-        table.add_row(frame.frame.name, *cells)
-    return table
+def learning_curve(prepared: Prepared, settings: Settings, variant: Variant) -> Floats:
+    """`METRICS` on the validation crops after each of `curve_steps` of one run: (steps, 2)."""
+    steps = curve_steps(settings.epochs)
+    chosen = replace(settings, method=variant.method, precision=variant.precision)
+    result = train(prepared, chosen, probe=False, recipe=variant.recipe, keep=steps)
+    accuracies = [validate(prepared, result.kept[step], chosen) for step in steps]
+    return np.array([[getattr(a, metric) for metric in METRICS] for a in accuracies])
+
+
+def curve_steps(epochs: int) -> tuple[int, ...]:
+    """Steps at which a run is looked at: none, two to every doubling, and its last one."""
+    last = epochs * -(-TRAIN_CROPS // BATCH)
+    doublings = range(2 * last.bit_length())
+    return tuple(
+        sorted({0, last} | {s for s in (round(2 ** (k / 2)) for k in doublings) if s < last})
+    )
+
+
+def gather(
+    epochs: int,
+    curves: Sequence[Curves],  # by frame
+    methods: Mapping[str, Variant],
+    grid: Sequence[Variant],
+    judged: Sequence[int],
+) -> Runs:
+    """One length's runs by name; the lowest mean angle error on `judged` is the grid's best.
+
+    The frames that choose are those reported on, which favours backpropagation.
+    """
+    together = {variant: np.stack([of[variant] for of in curves]) for variant in curves[0]}
+    errors = [np.mean(together[variant][judged, -1, ANGLE]) for variant in grid]
+    best = grid[int(np.argmin(np.nan_to_num(errors, nan=np.inf)))]
+    own = {name: together[variant] for name, variant in methods.items()}
+    steps = curve_steps(epochs)
+    untouched = np.repeat(own[SGM_INT8][:, :1], len(steps), axis=1)
+    return Runs(
+        epochs,
+        steps,
+        {UNTOUCHED: untouched, **own, BP_BEST: together[best]},
+        {variant.recipe: together[variant] for variant in grid},
+        best.recipe,
+    )
