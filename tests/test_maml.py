@@ -6,12 +6,17 @@ import pytest
 import torch
 
 from qsgm.train.graspnet import Loss
-from qsgm.train.maml import MamlConfig, MetaTraining, apply_sgm
+from qsgm.train.maml import MamlConfig, MetaTraining, Run, _Unrolled, apply_sgm
 from qsgm.train.sgm import Sgm
 from qsgm.train.tasks import TaskSet
 
 CONFIG = MamlConfig(
-    outer_steps=8, tasks_per_step=2, unroll=3, runs_per_task_slot=1, restart=0.0, warm_up=1
+    outer_steps=8,
+    tasks_per_step=2,
+    unroll=3,
+    runs_per_task_slot=1,
+    run_lengths=(100,),
+    warm_up=1,
 )
 
 
@@ -43,7 +48,7 @@ def objective_after_one_step(shift: torch.Tensor | None) -> tuple[float, torch.T
     torch.set_default_dtype(torch.float64)
     try:
         # The true gradients that are matched are targets, constant to autograd, not to the slope.
-        training = tiny_training(replace(CONFIG, matching_weight=(1e-15, 1e-15)))
+        training = tiny_training(replace(CONFIG, matching_weight=0.0))
         training.tasks = TaskSet(
             training.tasks.features.double(), training.tasks.labels.double(), 32
         )
@@ -61,9 +66,9 @@ def objective_after_one_step(shift: torch.Tensor | None) -> tuple[float, torch.T
 def test_the_meta_gradient_equals_finite_differences_through_the_whole_unrolled_run() -> None:
     _, gradient = objective_after_one_step(None)
     direction = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(1)).double()
-    step = 1e-5 * direction
+    step = 1e-7 * direction
     above, below = (objective_after_one_step(sign * step)[0] for sign in (1, -1))
-    slope = (above - below) / 2e-5
+    slope = (above - below) / 2e-7
     assert slope == pytest.approx(float((gradient * direction).sum()), rel=1e-3)
     assert abs(slope) > 1e-6
 
@@ -89,7 +94,7 @@ def test_a_map_with_many_positions_keeps_its_order() -> None:
 
 
 def test_outer_steps_change_sgms_start_and_rates_and_lower_the_query_loss() -> None:
-    config = replace(CONFIG, outer_steps=60, sgm_rate=1e-2, start_rate=1e-2, restart=0.3)
+    config = replace(CONFIG, outer_steps=60, sgm_rate=1e-2, start_rate=1e-2, run_lengths=(9,))
     training = tiny_training(config, rates=(1e-3, 1e-3, 1e-3))
     groups = training.optimizer.param_groups
     before = [p.detach().clone() for group in groups for p in group["params"]]
@@ -112,20 +117,32 @@ def test_a_run_that_blew_up_starts_afresh_and_teaches_nothing() -> None:
     assert all(run.states is None and run.age == 0 for run in training.runs)
 
 
-def test_runs_end_at_their_longest_age() -> None:
-    training = tiny_training(replace(CONFIG, longest_run=(6, 6)))
+def test_a_run_ends_at_its_length_and_another_takes_its_place() -> None:
+    training = tiny_training(replace(CONFIG, run_lengths=(6,)))
     training.outer_step()
     assert {run.age for run in training.runs} == {3}
     training.outer_step()
     assert {run.age for run in training.runs} == {0}
 
 
-def test_runs_may_grow_longer_until_half_way() -> None:
-    training = tiny_training(replace(CONFIG, longest_run=(100, 800), outer_steps=10))
-    lengths = []
-    for training.step in (0, 2, 5, 9):
-        lengths.append(training._longest_run())
-    assert lengths == [100, 380, 800, 800]
+def test_rates_decay_over_a_run_of_its_own_length_and_are_nothing_beyond_it() -> None:
+    training = tiny_training()
+    runs = [Run(0, length=4, age=1), Run(1, length=40, age=20), Run(2, length=3, age=5)]
+    assert _Unrolled(training, runs)._rate_factors().tolist() == [0.75, 0.5, 0.0]
+
+
+def test_the_first_step_of_a_run_is_the_devices_with_the_curvature_it_has_learnt() -> None:
+    training = tiny_training()
+    with torch.no_grad():
+        training.curvatures[6].out.mul_(3.0)
+    unrolled = _Unrolled(training, [Run(1, length=10)])
+    unrolled.advance(torch.Generator().manual_seed(3))
+    plain = _Unrolled(tiny_training(), [Run(1, length=10)])
+    plain.advance(torch.Generator().manual_seed(3))
+    start = training.start[2][0]
+    moved, moved_plainly = (run.states[2].weight - start for run in (unrolled, plain))
+    torch.testing.assert_close(moved, 3 * moved_plainly)
+    assert (moved != 0).any()
 
 
 def test_a_resumed_training_goes_on_with_the_same_parameters_and_schedule() -> None:

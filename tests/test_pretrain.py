@@ -7,27 +7,46 @@ from pathlib import Path
 import pytest
 import torch
 
+from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.train import partial as partial_module
 from qsgm.train import pretrain as module
+from qsgm.train import rates as rates_module
 from qsgm.train.backbone import BackboneConfig
 from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.early import EarlyConfig
 from qsgm.train.evaluate import Score
 from qsgm.train.graspnet import Loss
 from qsgm.train.maml import MamlConfig, MetaTraining
 from qsgm.train.matching import MatchingConfig
 from qsgm.train.partial import Partial
 from qsgm.train.pretrain import PretrainConfig, pretrain
+from qsgm.train.rates import RatesConfig
 
 TINY = PretrainConfig(
     hidden=(8,),
     tasks=2,
     crops_per_task=50,
-    trial_tasks=1,
-    trial_epochs=1,
     backbone=BackboneConfig(steps=4, frames_per_batch=2, crops_per_frame=8, loader_processes=0),
     matching=MatchingConfig(epochs=1, record_every=1, fit_steps=4, fit_batch=16),
     maml=MamlConfig(outer_steps=2, tasks_per_step=2, unroll=2, warm_up=1),
+    early=EarlyConfig(
+        tasks=2,
+        crops_per_task=20,
+        epochs=1,
+        looks=(1,),
+        steps=2,
+        tasks_per_step=1,
+        crops_per_step=2,
+    ),
+    rates=RatesConfig(
+        tasks=1,
+        crops_per_task=50,
+        epochs=1,
+        early_tasks=1,
+        early_crops_per_task=10,
+        early_epochs=1,
+    ),
 )
 
 
@@ -46,10 +65,20 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
 
     pretrain(tmp_path / "sgm.pt", 3, "cpu", watch, TINY)
     checkpoint = load_checkpoint(tmp_path / "sgm.pt")
-    assert sorted(checkpoint.sgms) == [4, 5]
-    assert {n: len(rates) for n, rates in checkpoint.rates.items()} == {1: 1, 2: 2, 3: 3}
+    assert sorted(checkpoint.sgms) == [1, 2, 3, 4, 5]
+    assert sorted(checkpoint.curvatures) == [4, 5, 6]
+    assert {b: len(rates) for b, rates in checkpoint.rates.items()} == {
+        str(single_layers(tuned)): tuned for tuned in range(1, 7)
+    }
     assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3 --hidden 8"
-    assert list(dict.fromkeys(stages)) == ["backbone", "tasks", "matching", "meta", "rates"]
+    assert list(dict.fromkeys(stages)) == [
+        "backbone",
+        "tasks",
+        "matching",
+        "meta",
+        "early",
+        "rates",
+    ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
     assert (checkpoint.card["device"], checkpoint.card["resumed"]) == ("cpu", False)
     text = (tmp_path / "sgm.md").read_text()
@@ -200,7 +229,7 @@ def test_meta_training_that_blows_up_leaves_no_output(
 def test_rates_that_all_diverge_leave_no_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "RATE_GRID", (1e38,))
+    monkeypatch.setattr(rates_module, "RATE_GRID", (1e38,))
     config = replace(TINY, trial_epochs=3)
     with pytest.raises(QsgmError, match=r"trial runs .* diverged"):
         pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)

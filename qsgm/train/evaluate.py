@@ -1,6 +1,6 @@
 """Whole fine-tuning runs on many tasks in torch: which rates work, and how well."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from qsgm.angles import AngleEncoding, angle_error, decode_angle
 from qsgm.errors import QsgmError
+from qsgm.train.curvature import Curvature
 from qsgm.train.graspnet import LAYERS, Loss
 from qsgm.train.local import LayerState, local_step, loss_gradient, outputs
 from qsgm.train.maml import MOMENTUM, apply_sgm
@@ -22,52 +23,75 @@ from qsgm.tuning import rate_factor
 class Score:
     """Means over tasks, on their query crops."""
 
-    loss: float
+    objective: float  # Loss.per_task
     detection_accuracy: float
     angle_mae_deg: float
 
 
+@dataclass(frozen=True)
+class UpdateRule:
+    """What fine-tunes the last layers: static SGMs, and how their gradients become steps."""
+
+    sgms: Mapping[int, Sgm]  # by layer
+    curvatures: Mapping[int, Curvature]
+    rates: tuple[float, ...]  # of the tuned layers, at the start of a run
+    loss: Loss
+
+    def gradient_of(self, layer: int, activation: Tensor, labels: Tensor) -> Tensor:
+        """Gradient (T, B, P, C) on a layer's activation; labels (T, B, 3)."""
+        if layer == LAYERS:
+            return loss_gradient(self.loss, activation, labels[:, :, None])
+        return apply_sgm(self.sgms[layer], activation, labels)
+
+
 @torch.no_grad()
-def run_sgms(
+def fine_tune(
+    rule: UpdateRule,
     start: Sequence[tuple[Tensor, Tensor]],
-    sgms: Mapping[int, Sgm],
-    rates: Sequence[float],
     tasks: TaskSet,
     epochs: int,
-    loss: Loss,
     seed: int = 0,
+) -> Iterator[list[LayerState]]:
+    """Fine-tune the last layers of every task at once; yields their states after every epoch."""
+    states = start_states(start, len(tasks))
+    batches = list(shuffled_batches(tasks.support, epochs, seed))
+    for step, rows in enumerate(batches, start=1):
+        features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
+        factor = rate_factor(step - 1, len(batches))
+        rates = [torch.tensor(rate * factor) for rate in rule.rates]
+        states = local_step(
+            states, features, labels, rates, rule.gradient_of, MOMENTUM, rule.curvatures
+        )
+        if step % (len(batches) // epochs) == 0:
+            yield states
+
+
+def run_sgms(
+    rule: UpdateRule,
+    start: Sequence[tuple[Tensor, Tensor]],
+    tasks: TaskSet,
+    epochs: int,
+    chunk: int = 8,
 ) -> Score:
-    """Fine-tune every task's last layers with static SGMs and score the result."""
-
-    def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
-        if layer == LAYERS:
-            return loss_gradient(loss, activation, labels[:, :, None])
-        return apply_sgm(sgms[layer], activation, labels)
-
+    """Fine-tune every task's last layers, `chunk` tasks at once, and score the result."""
     scores = []
-    for chunk in tasks.chunks(8):
-        states = start_states(start, len(chunk))
-        batches = list(shuffled_batches(chunk.support, epochs, seed))
-        for step, rows in enumerate(batches):
-            features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
-            now = [torch.tensor(rate * rate_factor(step, len(batches))) for rate in rates]
-            states = local_step(states, features, labels, now, gradient_of, MOMENTUM)
-        scores.append(score(states, chunk, loss))
+    for some in tasks.chunks(chunk):
+        *_, states = fine_tune(rule, start, some, epochs)
+        scores.append(score(states, some, rule.loss))
     return Score(*torch.cat(scores).mean(dim=0).tolist())
 
 
 @torch.no_grad()
 def score(states: Sequence[LayerState], tasks: TaskSet, loss: Loss) -> Tensor:
-    """Loss, detection accuracy and angle error [deg] on the query crops; (T, 3)."""
+    """Objective, detection accuracy and angle error [deg] on the query crops; (T, 3)."""
     features, labels = tasks.features[:, tasks.support :].float(), tasks.labels[:, tasks.support :]
     raw = outputs(states, features)
-    losses = loss.per_sample(raw.flatten(0, 1), labels.flatten(0, 1)).view(labels.shape[:2])
     seen = loss.activate(raw.flatten(0, 1)).view(labels.shape)
     positive = labels[..., 0] > 0
     detection = ((seen[..., 0] > 0.5) == positive).float().mean(dim=1)
     error = _angle_error_deg(seen, labels, loss.encoding)
     angle = (error * positive).sum(dim=1) / positive.sum(dim=1)
-    return torch.stack([losses.mean(dim=1), detection, angle], dim=1)
+    return torch.stack([loss.per_task(raw, labels), detection, angle], dim=1)
 
 
 def _angle_error_deg(seen: Tensor, labels: Tensor, encoding: AngleEncoding) -> Tensor:
@@ -79,12 +103,13 @@ def _angle_error_deg(seen: Tensor, labels: Tensor, encoding: AngleEncoding) -> T
 
 
 def best_rates(scores: Mapping[tuple[float, ...], Score]) -> tuple[float, ...]:
-    """The rates whose run ended with the lowest finite loss.
+    """The rates whose run ended with the lowest finite objective.
 
     Raises:
         QsgmError: there is none.
     """
-    finite = {rates: score.loss for rates, score in scores.items() if isfinite(score.loss)}
+    objectives = {rates: score.objective for rates, score in scores.items()}
+    finite = {rates: value for rates, value in objectives.items() if isfinite(value)}
     if not finite:
         raise QsgmError(
             f"pretraining failed: all {len(scores)} trial runs with the new SGMs diverged;"

@@ -22,6 +22,8 @@ POOL = 5
 # Keeps logits bounded, and with them the gradients' tails.
 LABEL_SMOOTHING = 0.05
 ANGLE_WEIGHT = 1.0
+# Under the root of a task's angle loss, whose slope at zero would have no end.
+SMALLEST_ANGLE_LOSS = 1e-4
 
 
 class Layer(nn.Module):
@@ -85,6 +87,22 @@ class Loss:
         quality = F.binary_cross_entropy_with_logits(raw[:, 0], target, reduction="none")
         angle = (self.activate(raw)[:, 1:] - labels[:, 1:]).square().sum(dim=1)
         return quality + self.angle_weight * labels[:, 0] * angle
+
+    def per_task(self, raw: Tensor, labels: Tensor) -> Tensor:
+        """What meta-training lowers, from raw outputs and labels (T, N, 3) to (T,).
+
+        Mean log loss on quality plus the root of the positives' mean squared angle error, so that
+        a tenth of it gone counts the same at a fine object as at a poor one. The plain loss listens
+        to round objects, whose angle cannot be learnt, and hardly to what is nearly right.
+        """
+        flat = labels.flatten(0, 1)
+        quality = labels[..., 0]
+        both = self.per_sample(raw.flatten(0, 1), flat).view(quality.shape)
+        angle = (self.activate(raw.flatten(0, 1))[:, 1:] - flat[:, 1:]).square().sum(dim=1)
+        angle = angle.view(quality.shape) * quality
+        detection = both - self.angle_weight * angle
+        error = angle.sum(dim=1) / quality.sum(dim=1).clamp(min=1.0)
+        return detection.mean(dim=1) + self.angle_weight * (error + SMALLEST_ANGLE_LOSS).sqrt()
 
     def __call__(self, raw: Tensor, labels: Tensor) -> Tensor:
         """Mean loss of a batch."""

@@ -6,13 +6,14 @@ so one matrix product advances every task. Convolutions are im2col followed by a
 weights stored as (kernel x kernel x in, out).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.graspnet import KERNELS, LAYERS, POOL_AFTER_LAYER, STRIDES, Loss
 
 # (layer, activation (T, B, P, C), labels (T, B, 3)) -> gradient of each sample's loss, same shape
@@ -110,6 +111,7 @@ def local_step(
     rates: Sequence[Tensor],
     gradient_of: GradientOf,
     momentum: float,
+    curvatures: Mapping[int, Curvature] = FLAT,
 ) -> list[LayerState]:
     """One feed-forward training step: every layer updates itself before the next one runs.
 
@@ -117,28 +119,32 @@ def local_step(
         states: the tuned layers, in order; the last of them is layer 6.
         features: (T, B, P, C), input of the first tuned layer.
         labels: (T, B, 3).
-        rates: one learning rate per layer, each a scalar or anything that broadcasts to the weight.
+        rates: one learning rate per layer, a scalar or one per task, (T,).
         gradient_of: where the gradient on an activation comes from (layer 6: the loss).
         momentum: of SGD.
+        curvatures: by layer, where there is one.
     """
     updated, x = [], features
     for layer, state, rate in zip(_numbers(states), states, rates, strict=True):
         col = columns(layer, x)
         before, x = layer_forward(layer, state, col)
         dz = through_activation(layer, before, gradient_of(layer, x, labels))
-        updated.append(sgd(state, *weight_gradients(col, dz), rate, momentum))
+        gradients = weight_gradients(col, dz)
+        if layer in curvatures:
+            gradients = curvatures[layer].bend(*gradients)
+        updated.append(sgd(state, *gradients, rate, momentum))
     return updated
 
 
 def sgd(
     state: LayerState, d_weight: Tensor, d_bias: Tensor, rate: Tensor, momentum: float
 ) -> LayerState:
-    """SGD with momentum as torch has it (no dampening)."""
+    """SGD with momentum as torch has it (no dampening); the rate a scalar or (T,)."""
     weight_momentum = momentum * state.weight_momentum + d_weight
     bias_momentum = momentum * state.bias_momentum + d_bias
     return LayerState(
-        state.weight - rate * weight_momentum,
-        state.bias - rate * bias_momentum,
+        state.weight - rate.view(-1, 1, 1) * weight_momentum,
+        state.bias - rate.view(-1, 1) * bias_momentum,
         weight_momentum,
         bias_momentum,
     )

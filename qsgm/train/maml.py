@@ -3,9 +3,10 @@
 Every outer step takes a few tasks, lets the SGMs train the tuned layers for some steps exactly as
 the device will, and differentiates through all of them (second order): what counts is the loss on
 crops held back, not how well a single gradient is matched. Learned are the SGMs, the start of the
-tuned layers and one rate per layer. Runs go on from one outer step to the next (truncated
-backpropagation through time) and restart at random, so that the SGMs meet every state from the
-first step to long after the last.
+tuned layers, one rate per layer and each layer's curvature. Every run has a length of its own, as
+short as an epoch on the device or as long as twenty, and its rates decay over it as they do there.
+Runs go on from one outer step to the next (truncated backpropagation through time), so that the
+SGMs meet every state from the first step to the last.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,31 +17,34 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from qsgm.train.curvature import Curvature
 from qsgm.train.graspnet import LAYERS, Loss
 from qsgm.train.local import LayerState, local_step, loss_gradient, outputs, true_gradients
 from qsgm.train.sgm import Sgm
 from qsgm.train.tasks import TaskSet
-from qsgm.tuning import BATCH
+from qsgm.tuning import BATCH, rate_factor
 
 MOMENTUM = 0.9
+# A run whose query loss is beyond this has blown up.
+LOST = 4.0
 
 
 @dataclass(frozen=True)
 class MamlConfig:
     """Sizes and rates of the third stage."""
 
-    outer_steps: int = 1200
+    outer_steps: int = 2000
     tasks_per_step: int = 6
     unroll: int = 16
-    runs_per_task_slot: int = 4  # runs kept going, per task of an outer step
-    restart: float = 0.04
-    longest_run: tuple[int, int] = (100, 800)  # at the start, and from half-way on
+    runs_per_task_slot: int = 5  # runs kept going, per task of an outer step
+    run_lengths: tuple[int, ...] = (25, 75, 150, 300, 500)  # steps; 25 is an epoch on the device
     sgm_rate: float = 1e-3
-    start_rate: float = 5e-5
-    log_rate_rate: float = 1e-3
+    start_rate: float = 1e-4
+    log_rate_rate: float = 3e-3
+    curvature_rate: float = 1e-3
     # Looking ahead a few steps only, meta-training would raise the rates without end.
     largest_rate_change: float = 3.0
-    matching_weight: tuple[float, float] = (1.0, 0.3)  # at the start and at the end
+    matching_weight: float = 0.1
     largest_gradient: float = 1.0
     warm_up: int = 50
 
@@ -50,6 +54,7 @@ class Run:
     """One task on its way: its tuned layers' states, `None` before the first step."""
 
     task: int
+    length: int  # steps after which its rates have decayed to nothing
     states: list[LayerState] | None = None
     age: int = 0
 
@@ -80,6 +85,10 @@ class MetaTraining:
         self.start = [tuple(nn.Parameter(t.clone()) for t in layer) for layer in start]
         self.log_rates = nn.Parameter(torch.tensor(rates).log())
         self.first_log_rates = self.log_rates.detach().clone()
+        self.curvatures = {
+            layer: _parameters(Curvature.identity(layer))
+            for layer in range(LAYERS + 1 - len(start), LAYERS + 1)
+        }
         self.generator = torch.Generator().manual_seed(seed)
         count = config.tasks_per_step * config.runs_per_task_slot
         self.runs = [self._fresh() for _ in range(count)]
@@ -90,6 +99,7 @@ class MetaTraining:
                 {"params": self._sgm_parameters(), "lr": config.sgm_rate},
                 {"params": [p for layer in self.start for p in layer], "lr": config.start_rate},
                 {"params": [self.log_rates], "lr": config.log_rate_rate},
+                {"params": self._curvature_parameters(), "lr": config.curvature_rate},
             ]
         )
         self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimizer, self._rate_factor)
@@ -110,16 +120,21 @@ class MetaTraining:
         for _ in range(self.config.unroll):
             unrolled.advance(self.generator)
         query = unrolled.query_loss()
-        objective = query + (unrolled.way + self._matching_weight() * unrolled.mismatch) / (
-            self.config.unroll
-        )
-        self._learn(objective.mean())
+        along = unrolled.way + self.config.matching_weight * unrolled.mismatch
+        self._learn((query + along / self.config.unroll).mean())
         self._keep(chosen, unrolled.states, query)
         return OuterFigures(
             float(query.detach().mean()),
             {layer: total / self.config.unroll for layer, total in unrolled.cosine.items()},
             tuple(self.log_rates.detach().exp().tolist()),
         )
+
+    def learnt_curvatures(self) -> dict[int, Curvature]:
+        """Each layer's curvature as it is now, without its history."""
+        return {
+            layer: Curvature(*(matrix.detach().clone() for matrix in one.matrices))
+            for layer, one in self.curvatures.items()
+        }
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on later; runs under way are not kept, they start afresh."""
@@ -128,6 +143,7 @@ class MetaTraining:
             "sgms": {layer: sgm.state_dict() for layer, sgm in self.sgms.items()},
             "start": [tuple(p.detach() for p in layer) for layer in self.start],
             "log_rates": self.log_rates.detach(),
+            "curvatures": [p.detach() for p in self._curvature_parameters()],
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.schedule.state_dict(),
             "generator": self.generator.get_state(),
@@ -143,6 +159,10 @@ class MetaTraining:
                 for parameter, value in zip(parameters, saved, strict=True):
                     parameter.copy_(value)
             self.log_rates.copy_(state["log_rates"])
+            for matrix, saved in zip(
+                self._curvature_parameters(), state["curvatures"], strict=True
+            ):
+                matrix.copy_(saved)
         self.optimizer.load_state_dict(state["optimizer"])
         self.schedule.load_state_dict(state["schedule"])
         self.generator.set_state(state["generator"])
@@ -164,19 +184,18 @@ class MetaTraining:
         self.log_rates.copy_(self.log_rates.clamp(low, high))
 
     def _keep(self, chosen: list[Run], states: list[LayerState], query: Tensor) -> None:
-        """Store where each run has got to; restart those that are old, lost or unlucky."""
-        lucky = torch.rand(len(chosen), generator=self.generator) >= self.config.restart
+        """Store where each run has got to; a new one takes the place of what is done or lost."""
         for i, run in enumerate(chosen):
             run.states = [_of_task(state, i) for state in states]
             run.age += self.config.unroll
             sound = all(torch.isfinite(state.weight).all() for state in run.states)
-            if not (lucky[i] and sound and torch.isfinite(query[i])) or (
-                run.age >= self._longest_run()
-            ):
+            if run.age >= run.length or not sound or not query[i] < LOST:
                 self.runs[self.runs.index(run)] = self._fresh()
 
     def _fresh(self) -> Run:
-        return Run(int(torch.randint(len(self.tasks), (1,), generator=self.generator)))
+        task = int(torch.randint(len(self.tasks), (1,), generator=self.generator))
+        lengths = self.config.run_lengths
+        return Run(task, lengths[int(torch.randint(len(lengths), (1,), generator=self.generator))])
 
     def _sgm_parameters(self) -> list[nn.Parameter]:
         return [p for sgm in self.sgms.values() for p in sgm.parameters()]
@@ -186,14 +205,8 @@ class MetaTraining:
         warm = min(1.0, (step + 1) / self.config.warm_up)
         return warm * (0.525 + 0.475 * cos(pi * step / self.config.outer_steps))
 
-    def _longest_run(self) -> float:
-        """Long runs come later: SGMs that have learnt little lead them astray."""
-        first, last = self.config.longest_run
-        return first + (last - first) * min(1.0, 2 * self.step / self.config.outer_steps)
-
-    def _matching_weight(self) -> float:
-        first, last = self.config.matching_weight
-        return float(first * (last / first) ** (self.step / self.config.outer_steps))
+    def _curvature_parameters(self) -> list[Tensor]:
+        return [matrix for one in self.curvatures.values() for matrix in one.matrices]
 
 
 class _Unrolled:
@@ -201,6 +214,8 @@ class _Unrolled:
 
     def __init__(self, training: MetaTraining, chosen: list[Run]) -> None:
         self.training = training
+        self.ages = [run.age for run in chosen]
+        self.lengths = [run.length for run in chosen]
         rows = [run.task for run in chosen]
         self.features = training.tasks.features[rows].to(training.log_rates.dtype)  # (T, N, P, C)
         self.labels = training.tasks.labels[rows]  # (T, N, 3)
@@ -224,16 +239,26 @@ class _Unrolled:
             given[layer] = apply_sgm(self.training.sgms[layer], activation, labels)
             return given[layer]
 
-        self.states = local_step(self.states, features, labels, self.rates, gradient_of, MOMENTUM)
+        factor = self._rate_factors()
+        self.states = local_step(
+            self.states,
+            features,
+            labels,
+            [rate * factor for rate in self.rates],
+            gradient_of,
+            MOMENTUM,
+            self.training.curvatures,
+        )
+        self.ages = [age + 1 for age in self.ages]
         raw = given.pop(LAYERS)[:, :, 0]
-        self.way = self.way + self._mean_loss(raw, labels)
+        self.way = self.way + self.training.loss.per_task(raw, labels)
         self._match(given, true)
 
     def query_loss(self) -> Tensor:
-        """Mean loss (T,) on the crops held back."""
+        """The objective (T,) on the crops held back."""
         support = self.training.tasks.support
         raw = outputs(self.states, self.features[:, support:])
-        return self._mean_loss(raw, self.labels[:, support:])
+        return self.training.loss.per_task(raw, self.labels[:, support:])
 
     def _match(self, given: dict[int, Tensor], true: dict[int, Tensor]) -> None:
         for layer, synthetic in given.items():
@@ -247,9 +272,10 @@ class _Unrolled:
                 ).mean()
             )
 
-    def _mean_loss(self, raw: Tensor, labels: Tensor) -> Tensor:
-        flat = self.training.loss.per_sample(raw.flatten(0, 1), labels.flatten(0, 1))
-        return flat.view(labels.shape[:2]).mean(dim=1)
+    def _rate_factors(self) -> Tensor:
+        """Where each run is in its rates' decay, (T,); one that is over stands still."""
+        runs = zip(self.ages, self.lengths, strict=True)
+        return torch.tensor([max(0.0, rate_factor(age, length)) for age, length in runs])
 
     def _batch(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         tasks, support = len(self.labels), self.training.tasks.support
@@ -261,6 +287,10 @@ class _Unrolled:
 
     def _start(self) -> list[LayerState]:
         return [LayerState.start(weight[None], bias[None]) for weight, bias in self.training.start]
+
+
+def _parameters(curvature: Curvature) -> Curvature:
+    return Curvature(*(nn.Parameter(matrix) for matrix in curvature.matrices))
 
 
 def apply_sgm(sgm: Sgm, activation: Tensor, labels: Tensor) -> Tensor:

@@ -1,9 +1,10 @@
-"""`qsgm pretrain`: from nothing to `sgm.pt`, in four stages, resumable.
+"""`qsgm pretrain`: from nothing to `sgm.pt`, in five stages, resumable.
 
 1. backbone: GraspNet learns drawn objects by backpropagation.
-2. matching: the SGMs regress true gradients.
-3. meta: MAML with the SGMs as the update rule, three layers tuned.
-4. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
+2. matching: the SGMs behind layers 4 and 5 regress true gradients.
+3. meta: MAML with these SGMs as the update rule, three layers tuned.
+4. early: the SGMs behind layers 1 to 3 regress true gradients.
+5. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
 
 What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
 version's same command: output, seed and device.
@@ -14,37 +15,41 @@ import os
 import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 import qsgm
+from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
 from qsgm.train.backbone import BackboneConfig, BackboneTraining, in_memory_format
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.evaluate import Score, best_rates, run_sgms
+from qsgm.train.early import EarlyConfig, EarlyMatching
+from qsgm.train.evaluate import Score, UpdateRule
 from qsgm.train.graspnet import LAYERS, GraspNet, Loss
-from qsgm.train.local import columns, layer_forward
 from qsgm.train.maml import MamlConfig, MetaTraining, OuterFigures
 from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
 from qsgm.train.partial import Partial
+from qsgm.train.rates import (
+    EARLY_RATE_GRID,
+    RatesConfig,
+    choose_early,
+    choose_late,
+    late_candidates,
+)
 from qsgm.train.sgm import Sgm
 from qsgm.train.start import folded_start, write_back
-from qsgm.train.tasks import TaskSet, draw_tasks, start_states
+from qsgm.train.tasks import TaskSet, draw_tasks
 
 TUNED = 3
 # Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
 # for its SGM to know what they do.
 FIRST_RATES = (6e-3, 1e-3, 3e-3)
-RATE_GRID = (3e-3, 1e-2, 3e-2, 1e-1)
-# Meta-training's rates are constant, the device's decay: they may start higher.
-META_RATE_FACTORS = (1.0, 1.5, 2.0, 3.0)
 SAVE_EVERY = 100
 
 # stage, steps done, steps in all, figures worth showing
@@ -56,13 +61,13 @@ class PretrainConfig:
     """Sizes of all stages; the defaults make the shipped checkpoint."""
 
     hidden: tuple[int, ...] = (64, 64)
-    tasks: int = 240
+    tasks: int = 400
     crops_per_task: int = 400
-    trial_tasks: int = 16
-    trial_epochs: int = 40
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     maml: MamlConfig = field(default_factory=MamlConfig)
+    early: EarlyConfig = field(default_factory=EarlyConfig)
+    rates: RatesConfig = field(default_factory=RatesConfig)
 
 
 def pretrain(
@@ -93,10 +98,13 @@ def pretrain(
     partial = Partial.open(output, _identity(seed, device, config, loss))
     net = _backbone(partial, config, loss, seed, device, watch)
     with one_thread():
-        sgms, rates, score = _learn_to_tune(partial, net, config, loss, seed, watch)
+        rule = _learn_to_tune(partial, net, config, loss, seed, watch)
+        early = _match_early(partial, net, rule, config, seed, watch)
+        rule = replace(rule, sgms={**early, **rule.sgms})
+        rates, score = _choose_rates(net, rule, config, seed, watch)
     command = _command(seed, device, config, loss)
     card = _card(command, device, config, score, partial)
-    checkpoint = Checkpoint(net, sgms, loss, rates, card)
+    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card)
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
     partial.remove()
@@ -127,14 +135,11 @@ def _identity(seed: int, device: str, config: PretrainConfig, loss: Loss) -> dic
 
 def _learn_to_tune(
     partial: Partial, net: GraspNet, config: PretrainConfig, loss: Loss, seed: int, watch: Watch
-) -> tuple[dict[int, Sgm], dict[int, tuple[float, ...]], Score]:
-    """Stages 2 to 4: SGMs, rates, and how well they do; `net` gets its new start."""
+) -> UpdateRule:
+    """Stages 2 and 3: what tunes the last three layers; `net` gets its new start."""
     tasks = _draw(net, config.tasks, config.crops_per_task, seed + 1, loss, watch)
     sgms = _match(partial, net, tasks, config, loss, seed, watch)
-    rates = _meta_train(partial, net, sgms, tasks, config, loss, seed, watch)
-    trial = _draw(net, config.trial_tasks, config.crops_per_task, seed + 2, loss, watch)
-    all_rates, score = _choose_rates(net, sgms, rates, trial, config, loss, watch)
-    return sgms, all_rates, score
+    return _meta_train(partial, net, sgms, tasks, config, loss, seed, watch)
 
 
 def _backbone(
@@ -167,7 +172,15 @@ def _portable(net: GraspNet) -> GraspNet:
     return in_memory_format(net.cpu(), torch.contiguous_format).eval()
 
 
-def _draw(net: GraspNet, count: int, crops: int, seed: int, loss: Loss, watch: Watch) -> TaskSet:
+def _draw(
+    net: GraspNet,
+    count: int,
+    crops: int,
+    seed: int,
+    loss: Loss,
+    watch: Watch,
+    last_frozen: int = LAYERS - TUNED,
+) -> TaskSet:
     done = 0
 
     def after_task() -> None:
@@ -175,7 +188,7 @@ def _draw(net: GraspNet, count: int, crops: int, seed: int, loss: Loss, watch: W
         done += 1
         watch("tasks", done, count, {})
 
-    return draw_tasks(net, count, crops, seed, loss, after_task)
+    return draw_tasks(net, count, crops, seed, loss, after_task, last_frozen)
 
 
 def _match(
@@ -220,7 +233,7 @@ def _meta_train(
     loss: Loss,
     seed: int,
     watch: Watch,
-) -> tuple[float, ...]:
+) -> UpdateRule:
     start = folded_start(net, TUNED)
     training = MetaTraining(config.maml, loss, tasks, start, sgms, FIRST_RATES, seed)
     if "meta" in partial.data:
@@ -241,46 +254,59 @@ def _meta_train(
     training.run(after_step)
     write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
     _refuse_unless_finite("meta", net, *sgms.values())
-    return tuple(float(rate) for rate in training.log_rates.detach().exp())
+    rates = tuple(float(rate) for rate in training.log_rates.detach().exp())
+    return UpdateRule(sgms, training.learnt_curvatures(), rates, loss)
+
+
+def _match_early(
+    partial: Partial,
+    net: GraspNet,
+    rule: UpdateRule,
+    config: PretrainConfig,
+    seed: int,
+    watch: Watch,
+) -> dict[int, Sgm]:
+    early = config.early
+    pixels = _draw(net, early.tasks, early.crops_per_task, seed + 4, rule.loss, watch, 0)
+    training = EarlyMatching(early, rule, folded_start(net, LAYERS), pixels, seed + 5)
+    if "early" in partial.data:
+        for layer, sgm in training.sgms.items():
+            sgm.load_state_dict(partial.data["early"][layer])
+        return {layer: sgm.eval() for layer, sgm in training.sgms.items()}
+    done = 0
+
+    def after_step(cosines: dict[int, float]) -> None:
+        nonlocal done
+        done += 1
+        watch("early", done, early.steps, {f"cos{layer}": c for layer, c in cosines.items()})
+
+    sgms = training.run(after_step)
+    _refuse_unless_finite("early", *sgms.values())
+    partial.save(early={layer: sgm.state_dict() for layer, sgm in sgms.items()})
+    return sgms
 
 
 def _choose_rates(
-    net: GraspNet,
-    sgms: dict[int, Sgm],
-    meta_rates: tuple[float, ...],
-    trial: TaskSet,
-    config: PretrainConfig,
-    loss: Loss,
-    watch: Watch,
-) -> tuple[dict[int, tuple[float, ...]], Score]:
-    """The best rates for every number of tuned layers, and how well those for the most do."""
-    candidates = {tuned: list(product(RATE_GRID, repeat=tuned)) for tuned in range(1, TUNED)}
-    candidates[TUNED] = [tuple(f * rate for rate in meta_rates) for f in META_RATE_FACTORS]
-    done, total = 0, sum(map(len, candidates.values()))
-    rates: dict[int, tuple[float, ...]] = {}
-    scores: dict[tuple[float, ...], Score] = {}
-    for tuned, choices in candidates.items():
-        tasks = _features_behind(folded_start(net, TUNED), TUNED - tuned, trial)
-        for choice in choices:
-            start = folded_start(net, tuned)
-            scores[choice] = run_sgms(start, sgms, choice, tasks, config.trial_epochs, loss)
-            done += 1
-            watch("rates", done, total, {"loss": scores[choice].loss})
-        rates[tuned] = best_rates({choice: scores[choice] for choice in choices})
-    return rates, scores[rates[TUNED]]
+    net: GraspNet, rule: UpdateRule, config: PretrainConfig, seed: int, watch: Watch
+) -> tuple[dict[str, tuple[float, ...]], Score]:
+    """The best rates for every number of tuned layers, and the score of three."""
+    sizes = config.rates
+    tasks = _draw(net, sizes.tasks, sizes.crops_per_task, seed + 2, rule.loss, watch)
+    done = 0
+    total = len([*late_candidates(rule.rates)]) + (LAYERS - TUNED) * len(EARLY_RATE_GRID)
 
+    def after_run(score: Score) -> None:
+        nonlocal done
+        done += 1
+        watch("rates", done, total, {"angle": score.angle_mae_deg})
 
-@torch.no_grad()
-def _features_behind(start: list[tuple[Tensor, Tensor]], layers: int, tasks: TaskSet) -> TaskSet:
-    """The same tasks, seen from behind the first `layers` of the tuned layers."""
-    states = start_states(start, 1)
-    features = []
-    for chunk in tasks.chunks(1):
-        x = chunk.features.float()
-        for number, state in list(enumerate(states, LAYERS + 1 - len(states)))[:layers]:
-            _, x = layer_forward(number, state, columns(number, x))
-        features.append(x)
-    return TaskSet(torch.cat(features), tasks.labels, tasks.support)
+    rates, score = choose_late(rule, folded_start(net, TUNED), tasks, sizes, after_run)
+    pixels = _draw(
+        net, sizes.early_tasks, sizes.early_crops_per_task, seed + 6, rule.loss, watch, 0
+    )
+    rule = replace(rule, rates=rates[TUNED])
+    rates |= choose_early(rule, folded_start(net, LAYERS), pixels, sizes, after_run)
+    return {str(single_layers(tuned)): of_layers for tuned, of_layers in rates.items()}, score
 
 
 def _check_device(device: str) -> None:
@@ -348,7 +374,7 @@ def _card_text(output: Path, card: dict[str, Any]) -> str:
     resumed = ", interrupted and resumed" if card["resumed"] else ""
     return f"""# {output.name}
 
-GraspNet and the static SGMs behind its layers 4 and 5, batchnorm not yet folded. Made by
+GraspNet and the static SGMs behind its layers 1 to 5, batchnorm not yet folded. Made by
 
     {card["command"]}
 

@@ -138,13 +138,14 @@ def draw_tasks(
     seed: int,
     loss: Loss,
     after_task: Callable[[], None],
+    last_frozen: int = 3,
 ) -> TaskSet:
     """Draw `count` objects and featurize `crops` of each; four fifths of them are support."""
     tasks = []
     for i in range(count):
         rng = np.random.default_rng((seed, i))
         frame = draw_frame(rng).image
-        tasks.append(make_task(net, frame, rng, last_frozen=3, count=crops, loss=loss))
+        tasks.append(make_task(net, frame, rng, last_frozen=last_frozen, count=crops, loss=loss))
         after_task()
     return TaskSet(
         torch.stack([task.features.half() for task in tasks]),

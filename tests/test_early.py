@@ -1,0 +1,98 @@
+"""The early SGMs' stage, and the choice of rates for many layers."""
+
+import pytest
+import torch
+from nets import random_net
+from torch.nn import functional as F
+
+from qsgm.train.curvature import FLAT
+from qsgm.train.early import EarlyConfig, EarlyMatching, behind
+from qsgm.train.evaluate import Score, UpdateRule
+from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.local import outputs
+from qsgm.train.rates import (
+    EARLY_RATE_GRID,
+    RatesConfig,
+    choose_early,
+    choose_late,
+    late_candidates,
+)
+from qsgm.train.sgm import Sgm
+from qsgm.train.start import folded_start
+from qsgm.train.tasks import TaskSet, draw_tasks, start_states
+
+CONFIG = EarlyConfig(
+    tasks=2, crops_per_task=20, epochs=2, looks=(1, 2), steps=40, tasks_per_step=2, crops_per_step=4
+)
+LOSS = Loss()
+
+
+@pytest.fixture(scope="module")
+def net() -> GraspNet:
+    return random_net(1)
+
+
+@pytest.fixture(scope="module")
+def pixels(net: GraspNet) -> TaskSet:
+    return draw_tasks(net, 2, 20, 5, LOSS, lambda: None, last_frozen=0)
+
+
+@pytest.fixture(scope="module")
+def rule() -> UpdateRule:
+    torch.manual_seed(0)
+    sgms = {layer: Sgm(layer).eval() for layer in range(1, 6)}
+    return UpdateRule(sgms, FLAT, (1e-3, 1e-3, 1e-3), LOSS)
+
+
+def test_features_behind_layers_are_those_of_the_network(net: GraspNet, pixels: TaskSet) -> None:
+    seen = behind(folded_start(net, 6)[:3], pixels)
+    whole = outputs(start_states(folded_start(net, 6), 2), pixels.features.float())
+    rest = outputs(start_states(folded_start(net, 3), 2), seen.features)
+    torch.testing.assert_close(rest, whole, atol=1e-4, rtol=1e-4)
+
+
+def test_early_sgms_learn_what_true_gradients_have_in_common(
+    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+) -> None:
+    training = EarlyMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
+    seen: list[float] = []
+    sgms = training.run(lambda cosines: seen.append(cosines[3]))
+    assert len(seen) == CONFIG.steps
+    assert sum(seen[-10:]) > sum(seen[:10]) + 1.0
+    # In the gradients' own size, not in the unit that they were learnt in.
+    activations, labels, true = training._batch()
+    maps = activations[3].flatten(0, 1).transpose(1, 2).unflatten(2, (13, 13))
+    given = sgms[3](maps, labels.flatten(0, 1)).detach()
+    assert 0.02 < float(given.norm() / true[3].norm()) < 50
+    assert all(not sgm.training for sgm in sgms.values())
+
+
+def test_layers_are_looked_at_before_during_and_after_runs(
+    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+) -> None:
+    training = EarlyMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
+    (moments,) = training.behind
+    weights = [states[0].weight for states in moments]
+    assert len(weights) == 3
+    torch.testing.assert_close(weights[0][0], folded_start(net, 3)[0][0])
+    moved = [F.mse_loss(weight, weights[0]).item() for weight in weights]
+    assert 0 == moved[0] < moved[1] < moved[2]
+
+
+def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_theirs(
+    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+) -> None:
+    scores: list[Score] = []
+    config = RatesConfig(epochs=1, early_epochs=1)
+    start = folded_start(net, 6)
+    late, best = choose_late(rule, start[3:], behind(start[:3], pixels), config, scores.append)
+    assert [len(late[tuned]) for tuned in (1, 2, 3)] == [1, 2, 3]
+    assert len(scores) == len([*late_candidates(rule.rates)])
+    assert best.objective == min(score.objective for score in scores[-4:])
+    rule = UpdateRule(rule.sgms, FLAT, late[3], LOSS)
+    early = choose_early(rule, start, pixels, config, scores.append)
+    assert sorted(early) == [4, 5, 6]
+    assert early[6][1:] == early[5]
+    assert early[5][1:] == early[4]
+    assert early[4][1:] == late[3]
+    assert {early[6][0], early[5][0], early[4][0]} <= set(EARLY_RATE_GRID)
