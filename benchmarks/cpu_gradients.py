@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
+from qsgm.blocks import single_layers
 from qsgm.bundle import load_bundle, probe_file
 from qsgm.fidelity import cosine
 from qsgm.paths import bundle_folder
@@ -41,7 +42,7 @@ def gradients(exact: str) -> dict[str, np.ndarray]:
     }
     for name, value in bundle.start_weights(TUNED).items():
         feeds[name] = to_step_layout(value) if value.ndim > 1 else value
-    names = [f"int8{layer}" for layer in bundle.sgm_layers(TUNED)]
+    names = [f"int8{layer}" for layer in single_layers(TUNED).sgm_layers]
     return {
         f"{name} exact={exact}": value
         for name, value in zip(names, session.run(names, feeds), strict=True)

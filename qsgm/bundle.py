@@ -3,8 +3,9 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -13,14 +14,14 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from qsgm.angles import ENCODINGS, AngleEncoding
+from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.defaults import MOST_LAYERS
 from qsgm.errors import QsgmError
 from qsgm.runtime import open_session
 
-LAYERS = 6
 MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
-VERSION = 1
+VERSION = 2
 NETWORK = "network.onnx"
 FLOAT_BYTES = 4
 COMMAND = "qsgm fold-and-quantize"
@@ -28,6 +29,7 @@ MANIFEST_KEYS: dict[str, type] = {
     "encoding": str,
     "label_smoothing": float,
     "most_layers": int,
+    "blocks": list,
     "files": dict,
     "initializers": dict,
     "recipes": dict,
@@ -55,10 +57,14 @@ def probe_file(tuned: int) -> str:
     return f"probe_{tuned}.onnx"
 
 
-def step_file(method: Method, precision: Precision, optimizer: OptimizerName, tuned: int) -> str:
-    """Name of a training step's graph; backpropagation has one precision, float."""
-    variant = "bp" if method == "bp" or tuned == 1 else f"sgm_{precision}"
-    return f"step_{variant}_{optimizer}_{tuned}.onnx"
+def step_file(precision: Precision, optimizer: OptimizerName, blocks: Blocks) -> str:
+    """Name of a training step's graph; a single block holds no SGM and is float only."""
+    return f"step_{precision if blocks.sgm_layers else 'float'}_{optimizer}_{blocks}.onnx"
+
+
+def default_blocks(method: Method, tuned: int) -> Blocks:
+    """With SGMs every layer is a block of its own; backpropagation has a single one."""
+    return one_block(tuned) if method == "bp" else single_layers(tuned)
 
 
 @dataclass(frozen=True)
@@ -92,15 +98,45 @@ class Bundle:
         """The largest number of layers this bundle can tune."""
         return int(self.manifest["most_layers"])
 
-    def sgm_layers(self, tuned: int) -> tuple[int, ...]:
-        """Layers with an SGM behind them when the last `tuned` layers are tuned."""
-        return tuple(range(LAYERS + 1 - tuned, LAYERS))
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """What it can tune with SGMs, such as `1-4,5,6`."""
+        return tuple(self.manifest["blocks"])
 
-    def recipe(self, method: Method, tuned: int, optimizer: OptimizerName | None) -> Recipe:
-        """The rates found for a method, with its own optimizer or the one asked for."""
+    def check_blocks(self, blocks: Blocks) -> None:
+        """Refuse what the bundle has no step for.
+
+        Raises:
+            QsgmError: says what it can tune.
+        """
+        tuned = len(blocks.layers)
+        if tuned > self.most_layers:
+            raise QsgmError(
+                f"the bundle {self.folder} can tune {self.most_layers} layers at most, not "
+                f"{tuned}; pass --layers {self.most_layers}"
+            )
+        if str(blocks) not in self.blocks and blocks != one_block(tuned):
+            raise QsgmError(
+                f"the bundle {self.folder} has no step for the blocks {blocks}; choose one of "
+                f"{' or '.join(self.blocks)}, or export it with `{COMMAND} --blocks {blocks}`"
+            )
+
+    def recipe(
+        self,
+        method: Method,
+        tuned: int,
+        optimizer: OptimizerName | None,
+        blocks: Blocks | None = None,
+    ) -> Recipe:
+        """The rates found for a method, with its own optimizer or the one asked for.
+
+        Without `blocks` for those of :func:`default_blocks`.
+        """
         recipes = self.manifest["recipes"][method]
         name: OptimizerName = optimizer or recipes["optimizer"]
-        return Recipe(name, tuple(recipes["rates"][name][str(tuned)]))
+        return Recipe(
+            name, tuple(recipes["rates"][name][str(blocks or default_blocks(method, tuned))])
+        )
 
     def session(self, name: str, threads: int = 1) -> ort.InferenceSession:
         """An ONNX Runtime session of one of the bundle's graphs."""
@@ -130,11 +166,6 @@ class Bundle:
         return values.reshape(place["shape"]).astype(np.float32)
 
 
-def tuned_layers(tuned: int) -> range:
-    """Numbers of the last `tuned` layers."""
-    return range(LAYERS + 1 - tuned, LAYERS + 1)
-
-
 def load_bundle(folder: Path) -> Bundle:
     """Read a bundle and check every file against the manifest.
 
@@ -158,14 +189,14 @@ def load_bundle(folder: Path) -> Bundle:
     return Bundle(folder, manifest)
 
 
-def needed_files(most_layers: int) -> set[str]:
-    """The graphs without which a bundle cannot do what its number of layers promises."""
+def needed_files(most_layers: int, blocks: Sequence[str]) -> set[str]:
+    """The graphs without which a bundle cannot do what its layers and blocks promise."""
     needed = {NETWORK}
     for tuned in range(1, most_layers + 1):
         needed |= {trunk_file(tuned), head_file(tuned)}
-        for optimizer in OPTIMIZERS:
-            needed |= {step_file("bp", "float", optimizer, tuned)}
-            needed |= {step_file("sgm", precision, optimizer, tuned) for precision in PRECISIONS}
+    steps = [*map(parse_blocks, blocks), *map(one_block, range(1, most_layers + 1))]
+    for precision, optimizer, one in product(PRECISIONS, OPTIMIZERS, steps):
+        needed.add(step_file(precision, optimizer, one))
     return needed
 
 
@@ -179,11 +210,12 @@ def _check_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     for key, (expected, is_sane) in _EXPECTED.items():
         try:
             sane = is_sane(manifest)
-        except (KeyError, TypeError, AttributeError, OSError):
+        except (KeyError, TypeError, AttributeError, OSError, QsgmError):
             sane = False
         if not sane:
             raise QsgmError(f"{path}: {key!r} is damaged: expected {expected}; run `{COMMAND}`")
-    missing = sorted(needed_files(manifest["most_layers"]) - manifest["files"].keys())
+    needed = needed_files(manifest["most_layers"], manifest["blocks"])
+    missing = sorted(needed - manifest["files"].keys())
     if missing:
         raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
     _check_places(path, manifest["initializers"], manifest["most_layers"])
@@ -211,17 +243,35 @@ def _is_place(place: Any, sides: int, size: float) -> bool:
     return len(shape) == sides and 0 <= offset <= size - FLOAT_BYTES * math.prod(shape)
 
 
+def _are_blocks(manifest: Mapping[str, Any]) -> bool:
+    """Whether it names blocks with SGMs, among them each layer on its own for any number."""
+    texts, most = manifest["blocks"], manifest["most_layers"]
+    singles = {str(single_layers(tuned)) for tuned in range(1, most + 1)}
+    return (
+        singles <= set(texts)
+        and len(set(texts)) == len(texts)
+        and all(_has_sgms(parse_blocks(text), most) for text in set(texts) - singles)
+    )
+
+
+def _has_sgms(blocks: Blocks, most_layers: int) -> bool:
+    return len(blocks.layers) <= most_layers and len(blocks.sgm_layers) > 0
+
+
 def _are_recipes(manifest: Mapping[str, Any]) -> bool:
-    """Whether every method has an optimizer, and rates for it and for any number of layers."""
+    """Whether every method has an optimizer, and rates for it and for whatever it can tune."""
+    tuned = range(1, manifest["most_layers"] + 1)
+    can_tune = {"sgm": manifest["blocks"], "bp": [str(one_block(layers)) for layers in tuned]}
     for method in get_args(Method):
         recipe = manifest["recipes"][method]
         if recipe["optimizer"] not in OPTIMIZERS:
             return False
-        for optimizer in OPTIMIZERS:
-            for tuned in range(1, manifest["most_layers"] + 1):
-                rates = recipe["rates"][optimizer][str(tuned)]
-                if len(rates) != tuned or not all(0 < rate < math.inf for rate in rates):
-                    return False
+        for optimizer, text in product(OPTIMIZERS, can_tune[method]):
+            rates = recipe["rates"][optimizer][text]
+            if len(rates) != len(parse_blocks(text).layers):
+                return False
+            if not all(0 < rate < math.inf for rate in rates):
+                return False
     return True
 
 
@@ -230,6 +280,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Mapping[str, Any]], bool]]] = {
     "encoding": (" or ".join(ENCODINGS), lambda found: found["encoding"] in ENCODINGS),
     "label_smoothing": ("0 to below 1", lambda found: 0 <= found["label_smoothing"] < 1),
     "most_layers": (f"1 to {MOST_LAYERS}", lambda found: 1 <= found["most_layers"] <= MOST_LAYERS),
+    "blocks": ("texts such as 5,6 and 4,5-6, each once, for every number of layers", _are_blocks),
     "recipes": ("positive rates, one per tuned layer, for every method", _are_recipes),
 }
 

@@ -27,6 +27,7 @@ from qsgm import __version__, defaults, paths
 from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
+    from qsgm.blocks import Blocks
     from qsgm.bundle import Bundle
     from qsgm.finetuning import FinetuneResult, Settings
 
@@ -36,7 +37,8 @@ LARGEST_HIDDEN = 1024
 # UsageError; typer keeps it in another place in every other version.
 USAGE_ERROR = cast(type[Exception], typer.BadParameter.__base__)
 LARGEST_SEED = 2**31 - 1  # what numpy and torch take both
-HOST_LIBRARIES = ("torch", "onnx")
+# library: the extra that brings it
+HOST_LIBRARIES = {"torch": "train", "onnx": "train", "matplotlib": "report"}
 
 # (stage, done, of how many, values to show)
 Watch = Callable[..., None]
@@ -94,6 +96,13 @@ PrecisionOption = Annotated[
 MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
 LayersOption = Annotated[
     int, typer.Option(min=1, max=defaults.MOST_LAYERS, help="How many of the last to tune.")
+]
+BlocksOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A-B,C",
+        help="Groups of the last layers that share one gradient, such as 1-4,5,6; default: none.",
+    ),
 ]
 OptimizerOption = Annotated[
     OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
@@ -191,12 +200,18 @@ def fold_and_quantize(
         Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("export"),
+    blocks: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B,C", help="Also export steps for these blocks; repeatable."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
+    more = [_blocks(text) for text in blocks or ()]
     host = _host_module("qsgm.train.export")
+    calibration = paths.calibration_folder(calib)
     with _progress() as watch:
-        report = host.fold_and_quantize(checkpoint, paths.calibration_folder(calib), output, watch)
+        report = host.fold_and_quantize(checkpoint, calibration, output, watch, blocks=more)
     _show(report.to_json(), report, as_json)
 
 
@@ -205,7 +220,16 @@ def finetune(
     frame: FrameArgument,
     int8: PrecisionOption = None,
     method: MethodOption = MethodName.SGM,
-    layers: LayersOption = defaults.LAYERS,
+    layers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=defaults.MOST_LAYERS,
+            help="How many of the last to tune.",
+            show_default=str(defaults.LAYERS),
+        ),
+    ] = None,
+    blocks: BlocksOption = None,
     optimizer: OptimizerOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
     seed: SeedOption = 0,
@@ -223,7 +247,8 @@ def finetune(
     from qsgm.report import finetune_json, finetune_report
     from qsgm.tuned import DESCRIPTION
 
-    settings = _settings(int8, method, layers, optimizer, epochs, seed, center, threads)
+    tuned = _tuned(layers, blocks)
+    settings = _settings(int8, method, tuned, optimizer, epochs, seed, center, threads, blocks)
     folder = paths.object_folder(frame) if output is None else output
     check_replaceable(folder, DESCRIPTION)
     result = _finetune(frame, _bundle(bundle), settings)
@@ -298,25 +323,44 @@ def bench_accuracy(
     frames: FramesOption = None,
     layers: LayersOption = defaults.LAYERS,
     epochs: EpochsOption = defaults.EPOCHS,
+    short: Annotated[
+        str, typer.Option(metavar="N,N", help="Epochs of further, shorter runs; '' for none.")
+    ] = defaults.SHORT_RUNS,
     limit: LimitOption = None,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
     output: ReportOption = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Draw learning curves here, JSON beside (matplotlib)."),
+    ] = None,
     per_frame: Annotated[bool, typer.Option("--per-frame", help="A line per frame, too.")] = False,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Untouched, SGM in int8 and float, backpropagation: on the same crops of every frame."""
+    """Untouched, SGM in int8 and float, backpropagation: on the same crops of every frame.
+
+    Every run length is a run of its own, its rates decaying to nothing at its end. `bp best` is
+    backpropagation with the optimizer and rate of a small grid that do best on these very frames:
+    more than any user could know beforehand.
+    """
     from qsgm.bench.accuracy import measure_accuracy
+    from qsgm.bench.accuracy_report import accuracy_report_json, render
     from qsgm.bench.frames import list_frames
     from qsgm.finetuning import Settings
 
+    charts = None if pictures is None else _host_module("qsgm.train.charts")
+    lengths = _run_lengths(short)
     some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
     with _progress() as watch:
-        report = measure_accuracy(some, _bundle(bundle), settings, watch)
-    _write_report(report.to_json(), output)
-    _show(report.to_json(), report.render(per_frame), as_json)
+        report = measure_accuracy(some, _bundle(bundle), settings, lengths, watch)
+    values = accuracy_report_json(report)
+    _show(values, render(report, per_frame), as_json)
+    _write_report(values, output)
+    if pictures is not None and charts is not None:
+        charts.write_learning_curves(report, pictures / "learning_curves.png")
+        _write_report(values, pictures / "accuracy.json")
 
 
 @bench.command("scenes")
@@ -373,6 +417,30 @@ def bench_speed(
         report = measure_speed(frame, _bundle(bundle), settings, repeats, watch)
     _write_report(report, output)
     _show(report, render(report), as_json)
+
+
+@bench.command("paper")
+def bench_paper(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Sizes at which it runs in seconds and means nothing.")
+    ] = False,
+    sheet: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a picture of the objects here.")
+    ] = None,
+    seed: SeedOption = 0,
+    output: ReportOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The paper's tables again, on drawn objects, and its other systems (host; needs torch)."""
+    experiment = _host_module("qsgm.train.paper.experiment")
+    host = _host_module("qsgm.train.paper.report")
+    config = experiment.QUICK if quick else experiment.PaperConfig()
+    if sheet is not None:
+        host.write_sheet(sheet, config)
+    with _progress() as watch:
+        results = experiment.measure_paper(config, seed, watch)
+    _write_report(host.to_json(results), output)
+    _show(host.to_json(results), host.render(results), as_json)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -446,6 +514,7 @@ def _settings(
     seed: int,
     center: str | None,
     threads: int,
+    blocks: str | None = None,
 ) -> "Settings":
     from qsgm.finetuning import Settings
 
@@ -455,12 +524,34 @@ def _settings(
         method=method.value,
         precision="float" if int8 is False or method is MethodName.BP else "int8",
         layers=layers,
+        blocks=blocks,
         optimizer=None if optimizer is None else optimizer.value,
         epochs=epochs,
         seed=seed,
         center_px=_center(center),
         threads=threads,
     )
+
+
+def _tuned(layers: int | None, blocks: str | None) -> int:
+    """How many layers to tune: the blocks, if given, say it."""
+    if blocks is None:
+        return defaults.LAYERS if layers is None else layers
+    held = len(_blocks(blocks).layers)
+    if layers not in (None, held):
+        raise typer.BadParameter(
+            f"{blocks} is {held} layers, but --layers says {layers}", param_hint="'--blocks'"
+        )
+    return held
+
+
+def _blocks(text: str) -> "Blocks":
+    from qsgm.blocks import parse_blocks
+
+    try:
+        return parse_blocks(text)
+    except QsgmError as error:
+        raise typer.BadParameter(str(error), param_hint="'--blocks'") from error
 
 
 def _channels(text: str) -> tuple[int, ...]:
@@ -474,6 +565,19 @@ def _channels(text: str) -> tuple[int, ...]:
             param_hint="'--hidden'",
         )
     return channels
+
+
+def _run_lengths(text: str) -> tuple[int, ...]:
+    try:
+        lengths = tuple(int(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        lengths = (0,)
+    if not all(length >= 1 for length in lengths):
+        raise typer.BadParameter(
+            f"{text!r} gives no run lengths: expected numbers of epochs, such as 1,3",
+            param_hint="'--short'",
+        )
+    return lengths
 
 
 def _center(text: str | None) -> tuple[float, float] | None:
@@ -518,7 +622,7 @@ def _host_module(name: str) -> Any:
             raise
         raise QsgmError(
             f"this command runs on the host and needs {missing}, which is not installed: "
-            f"pip install -c constraints.txt '.[train]' in a checkout"
+            f"pip install -c constraints.txt '.[{HOST_LIBRARIES[missing]}]' in a checkout"
         ) from error
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+# What a probe says of each SGM, the layer's number behind the name.
+PROBED = ("int8", "float", "true", "clipped")
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class LayerFidelity:
 
 
 def compare(int8: Array, floating: Array, true: Array, clipped: float) -> LayerFidelity:
-    """Compare the gradients (B, C) of one batch."""
+    """Compare the gradients (B, P, C) of one batch."""
     return LayerFidelity(
         cos_int8_float=cosine(int8, floating),
         cos_int8_true=cosine(int8, true),

@@ -9,16 +9,18 @@ method on it, so that methods can be compared on the very same crops.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import onnxruntime as ort
 from numpy.typing import NDArray
 
 from qsgm import defaults
 from qsgm.angles import angle_error, decode_angle, mean_direction
+from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.bundle import (
     COMMAND,
     Bundle,
@@ -30,15 +32,14 @@ from qsgm.bundle import (
     probe_file,
     step_file,
     trunk_file,
-    tuned_layers,
 )
 from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.errors import QsgmError
-from qsgm.fidelity import LayerFidelity, compare_probe, mean_over_run
+from qsgm.fidelity import PROBED, LayerFidelity, compare_probe, mean_over_run
 from qsgm.report import run_json
 from qsgm.runtime import running
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
-from qsgm.tuning import BATCH, StepLoop, tune
+from qsgm.tuning import BATCH, Features, StepLoop, tune
 from qsgm.weights import to_conv_layout, to_step_layout
 
 Array = NDArray[np.float32]
@@ -50,8 +51,15 @@ SLICE = 50
 DETECTION_THRESHOLD = 0.5
 # More of an SGM's inputs than this outside its ranges: the object is unlike the calibration set.
 NOTABLE_CLIPPING = 0.01
-# What each tunable layer leaves per crop: convolution and ReLU, and the pool's one position.
-OUTPUTS_PER_CROP = {4: 16 * (2 * 25 + 1), 5: 16 * 2, 6: 3}
+# What each layer leaves per crop: convolution and ReLU, and the pool's one position.
+OUTPUTS_PER_CROP = {
+    1: 8 * 2 * 62**2,
+    2: 8 * 2 * 29**2,
+    3: 16 * 2 * 13**2,
+    4: 16 * (2 * 5**2 + 1),
+    5: 16 * 2,
+    6: 3,
+}
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,7 @@ class Settings:
     method: Method = "sgm"
     precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
     layers: int = defaults.LAYERS  # how many of the last ones
+    blocks: str | None = None  # those layers in groups, such as 4,5-6; None: each on its own
     optimizer: OptimizerName | None = None
     epochs: int = defaults.EPOCHS
     seed: int = 0
@@ -90,7 +99,7 @@ class Prepared:
 
     bundle: Bundle
     settings: Settings
-    features: Array  # (N, P, C), input of the first tuned layer
+    features: Features  # (N, P, C), input of the first tuned layer
     labels: Array  # (N, 3)
     angle_rad: NDArray[np.float64]  # (N,) of the labels, the offset included
     offset_rad: float  # the demonstration's orientation as the untouched network sees it
@@ -113,6 +122,8 @@ class FinetuneResult:
     probes: tuple[Probe, ...]
     seconds: dict[str, float]  # crops, features, tuning, probes, total
     warnings: tuple[str, ...] = field(default=())
+    # by step (0: before the first), in the step graphs' layout
+    kept: Mapping[int, dict[str, Array]] = field(default_factory=dict)
 
     @property
     def zero_shot(self) -> Accuracy:
@@ -128,9 +139,14 @@ class FinetuneResult:
         return {k: mean_over_run([probe.layers[k] for probe in self.probes]) for k in layers}
 
     @property
+    def blocks(self) -> Blocks:
+        """What was trained, block by block."""
+        return run_blocks(self.settings)
+
+    @property
     def peak_activation_bytes(self) -> dict[str, int]:
         """Layer outputs that have to be alive at once; see :func:`peak_activation_bytes`."""
-        return peak_activation_bytes(self.settings.layers)
+        return peak_activation_bytes(sgm_blocks(self.settings))
 
     def network(self) -> bytes:
         """The tuned network as an ONNX file: a frame in, its heatmap out."""
@@ -157,6 +173,42 @@ class FinetuneResult:
         return ObjectDescription(name, self.prepared.bundle.encoding, self.prepared.offset_rad)
 
 
+def sgm_blocks(settings: Settings) -> Blocks:
+    """The blocks of a run with SGMs: what its steps are, or what backpropagation is compared with.
+
+    Raises:
+        QsgmError: the settings' blocks are none, or those of another number of layers.
+    """
+    if settings.blocks is None:
+        return single_layers(settings.layers)
+    blocks = parse_blocks(settings.blocks)
+    if len(blocks.layers) != settings.layers:
+        raise QsgmError(
+            f"the blocks {blocks} are the last {len(blocks.layers)} layers, the settings say "
+            f"{settings.layers}: give both the same"
+        )
+    return blocks
+
+
+def run_blocks(settings: Settings) -> Blocks:
+    """The blocks that are really trained.
+
+    Raises:
+        QsgmError: as :func:`sgm_blocks`, or the blocks do not go with the method.
+    """
+    blocks, whole = sgm_blocks(settings), one_block(settings.layers)
+    if settings.method == "sgm":
+        if blocks == whole and settings.layers > 1:
+            raise QsgmError(f"the blocks {blocks} leave no place for an SGM: pass --method bp")
+        return blocks
+    if settings.blocks is not None and blocks != whole:
+        raise QsgmError(
+            f"backpropagation trains all layers as one block, {whole}, not as {blocks}: leave "
+            "--blocks out, or --method bp"
+        )
+    return whole
+
+
 def finetune(
     frame: NDArray[np.uint8],
     bundle: Bundle,
@@ -178,15 +230,12 @@ def prepare(
 ) -> Prepared:
     """Crops, features, labels and what the untouched network makes of them.
 
-    Of the settings only `layers`, `seed`, `center_px` and `threads` matter here.
+    Of the settings only `layers`, `seed`, `center_px` and `threads` matter here; the others are
+    checked.
     """
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
-    if settings.layers > bundle.most_layers:
-        raise QsgmError(
-            f"the bundle {bundle.folder} can tune {bundle.most_layers} layers at most, not "
-            f"{settings.layers}; pass --layers {bundle.most_layers}"
-        )
+    bundle.check_blocks(run_blocks(settings))
     began = time.perf_counter()
     height, width = frame.shape[:2]
     center = settings.center_px or (width / 2, height / 2)
@@ -223,10 +272,10 @@ def see(
     settings: Settings,
     seconds: dict[str, float],
     watch: Watch,
-) -> Array:
+) -> Features:
     """Features (N, P, C) of the planned crops, cut slice by slice: they never all exist."""
     session = bundle.session(trunk_file(settings.layers), settings.threads)
-    features: Array | None = None
+    features: Features | None = None
     for first in range(0, len(plan), SLICE):
         rows = slice(first, min(first + SLICE, len(plan)))
         with _adding_to(seconds, "crops"):
@@ -235,7 +284,7 @@ def see(
             with running_graphs(bundle):
                 some = session.run(["features"], {"crops": crops})[0]
             if features is None:
-                features = np.empty((len(plan), *some.shape[1:]), np.float32)
+                features = np.empty((len(plan), *some.shape[1:]), some.dtype)
             features[rows] = some
         watch("crops", rows.stop, len(plan))
     assert features is not None, "a plan has at least one crop"
@@ -243,7 +292,7 @@ def see(
 
 
 def answers(
-    features: Array, weights: Mapping[str, Array], bundle: Bundle, settings: Settings
+    features: Features, weights: Mapping[str, Array], bundle: Bundle, settings: Settings
 ) -> Array:
     """Quality, sine and cosine (N, 3) that the tuned layers give with these weights."""
     session = bundle.session(head_file(settings.layers), settings.threads)
@@ -269,16 +318,24 @@ def accuracy_of(
 
 
 def train(
-    prepared: Prepared, settings: Settings, watch: Watch | None = None, *, probe: bool = True
+    prepared: Prepared,
+    settings: Settings,
+    watch: Watch | None = None,
+    *,
+    probe: bool = True,
+    recipe: Recipe | None = None,
+    keep: Collection[int] = (),
 ) -> FinetuneResult:
     """One run of one method on a prepared demonstration; what was prepared stays as it is.
 
     Args:
         prepared: as :func:`prepare` returned it.
-        settings: may differ from those it was prepared with in `method`, `precision`,
+        settings: may differ from those it was prepared with in `method`, `precision`, `blocks`,
             `optimizer`, `epochs` and `threads`.
         watch: told about every epoch.
         probe: whether to measure the gradients' fidelity.
+        recipe: optimizer and rates; None: the bundle's for these settings.
+        keep: steps after which the weights are kept (0: before the first).
 
     Raises:
         QsgmError: training diverged, or the bundle lacks the method.
@@ -289,12 +346,14 @@ def train(
         raise ValueError(f"prepared for {prepared.settings.layers} layers, not for {layers}")
     if settings.method == "bp":
         settings = replace(settings, precision="float")
-    recipe = bundle.recipe(settings.method, layers, settings.optimizer)
-    loop = _GuardedLoop(prepared, settings, recipe)
+    blocks = run_blocks(settings)
+    bundle.check_blocks(blocks)
+    recipe = recipe or bundle.recipe(settings.method, layers, settings.optimizer, blocks)
+    loop = _GuardedLoop(prepared, settings, recipe, keep)
     prober = _Prober(prepared, settings, probe)
     losses, tuning = _run_epochs(loop, prober, settings, watch or _ignore)
     weights = loop.weights()
-    accuracy = _validate(prepared, weights, settings)
+    accuracy = validate(prepared, weights, settings)
     seconds = prepared.seconds | {"tuning": tuning, "probes": prober.seconds}
     seconds["total"] = prepared.seconds["total"] + time.perf_counter() - began
     result = FinetuneResult(
@@ -306,6 +365,7 @@ def train(
         tuple(losses),
         tuple(prober.probes),
         seconds,
+        kept=loop.kept,
     )
     return replace(result, warnings=drift_warnings(result))
 
@@ -330,8 +390,8 @@ def _run_epochs(
     return losses, time.perf_counter() - began - (prober.seconds - probing)
 
 
-def _validate(prepared: Prepared, weights: Mapping[str, Array], settings: Settings) -> Accuracy:
-    """On the crops that took no part in training."""
+def validate(prepared: Prepared, weights: Mapping[str, Array], settings: Settings) -> Accuracy:
+    """Weights, in the step graphs' layout, on the crops that took no part in training."""
     rows = slice(TRAIN_CROPS, None)
     outputs = answers(prepared.features[rows], weights, prepared.bundle, settings)
     return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
@@ -354,36 +414,43 @@ def drift_warnings(result: FinetuneResult) -> tuple[str, ...]:
     )
 
 
-def peak_activation_bytes(layers: int, batch: int = BATCH) -> dict[str, int]:
-    """Bytes of layer outputs that have to be alive at once while the last `layers` are trained.
+def peak_activation_bytes(blocks: Blocks, batch: int = BATCH) -> dict[str, int]:
+    """Bytes of layer outputs that have to be alive at once while these layers are trained.
 
-    Counted as the paper's Table 3 does, in float32: a layer's convolution, ReLU and pool (its
-    batchnorm is folded here). Backpropagation keeps those of all layers for the way back. With
-    SGMs a layer is done before the next one runs, so it is the largest layer's. Windows, weights
-    and features are not counted; both methods need them.
+    Counted in float32: a layer's convolution, ReLU and pool (its batchnorm is folded here), which
+    is how the paper's Table 3 counts layers 4 and 5; of layers 1 to 3 it counts one tensor.
+    Backpropagation keeps those of all layers for the way back. With SGMs a block is done before
+    the next one runs, so it is the largest block's. Windows, weights and features are not counted,
+    both methods need them; nor is what SGMs and gradients take on the way.
     """
-    outputs = [4 * batch * OUTPUTS_PER_CROP[k] for k in tuned_layers(layers)]
+    outputs = [sum(4 * batch * OUTPUTS_PER_CROP[k] for k in block) for block in blocks.groups]
     return {"sgm": max(outputs), "backprop": sum(outputs)}
 
 
 class _GuardedLoop(StepLoop):
-    """Stops at the first step that leaves the realm of numbers."""
+    """Stops at the first step that leaves the realm of numbers; keeps weights on the way."""
 
-    def __init__(self, prepared: Prepared, settings: Settings, recipe: Recipe) -> None:
-        bundle, layers = prepared.bundle, settings.layers
-        name = step_file(settings.method, settings.precision, recipe.optimizer, layers)
+    def __init__(
+        self, prepared: Prepared, settings: Settings, recipe: Recipe, keep: Collection[int]
+    ) -> None:
+        bundle, blocks = prepared.bundle, run_blocks(settings)
+        name = step_file(settings.precision, recipe.optimizer, blocks)
         session = bundle.session(name, settings.threads)
-        rates = dict(zip(tuned_layers(layers), recipe.rates, strict=True))
+        rates = dict(zip(blocks.layers, recipe.rates, strict=True))
         self.steps = 0
         self._bundle = bundle
         with running_graphs(bundle):
             super().__init__(session, prepared.features, prepared.labels, prepared.start, rates)
+        self._keep = keep
+        self.kept: dict[int, dict[str, Array]] = {}
+        self._keep_weights()
 
     def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
         with running_graphs(self._bundle):
             loss = super().step(rows, factor)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
+        self._keep_weights()
         return loss
 
     def refuse_unless_finite(self, finite: bool, what: str) -> None:
@@ -393,6 +460,10 @@ class _GuardedLoop(StepLoop):
                 f"Try another --method or --optimizer, or a frame with the object at its centre"
             )
 
+    def _keep_weights(self) -> None:
+        if self.steps in self._keep:
+            self.kept[self.steps] = self.weights()
+
 
 class _Prober:
     """Compares gradients on one random training batch at a time and keeps what it finds."""
@@ -400,7 +471,7 @@ class _Prober:
     def __init__(self, prepared: Prepared, settings: Settings, wanted: bool) -> None:
         began = time.perf_counter()
         self.probes: list[Probe] = []
-        self._layers = prepared.bundle.sgm_layers(settings.layers)
+        self._layers = sgm_blocks(settings).sgm_layers
         self._rng = np.random.default_rng([settings.seed, 2])
         self._session = None
         self._bundle = prepared.bundle
@@ -415,9 +486,11 @@ class _Prober:
             return
         began = time.perf_counter()
         rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
-        names = [output.name for output in self._session.get_outputs()]
+        names = [f"{kind}{k}" for k in self._layers for kind in PROBED]
+        options = ort.RunOptions()
+        options.only_execute_path_to_fetches = True  # not the SGMs that take no part in the run
         with running_graphs(self._bundle):
-            values = self._session.run(names, {**self._data, "rows": rows, **weights})
+            values = self._session.run(names, {**self._data, "rows": rows, **weights}, options)
         outputs = dict(zip(names, values, strict=True))
         self.probes.append(Probe(epoch, compare_probe(outputs, self._layers)))
         self.seconds += time.perf_counter() - began

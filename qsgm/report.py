@@ -71,6 +71,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "fidelity": {str(k): fidelity_json(v) for k, v in result.fidelity.items()},
         "seconds": seconds_json(result.seconds),
         "peak_activation_bytes": result.peak_activation_bytes,
+        "blocks": str(result.blocks),
         "optimizer": result.recipe.optimizer,
         "rates": list(result.recipe.rates),
         "orientation_deg": angle(math.degrees(result.prepared.offset_rad), 2),
@@ -158,7 +159,8 @@ def before_after_table(result: "FinetuneResult", name: str) -> Table:
     """What tuning changed on the validation crops."""
     settings = result.settings
     how = settings.method if settings.method == "bp" else f"sgm {settings.precision}"
-    title = f"{name}: last {settings.layers} layers, {how}, {settings.epochs} epochs"
+    which = f"blocks {settings.blocks}" if settings.blocks else f"last {settings.layers} layers"
+    title = f"{name}: {which}, {how}, {settings.epochs} epochs"
     table = plain_table(title)
     table.add_column("200 validation crops")
     table.add_column("detection", justify="right")

@@ -6,12 +6,15 @@ step, which ONNX Runtime does not promise to be safe.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+# What the frozen layers leave; where nothing is frozen, the pixels.
+Features = NDArray[np.float32] | NDArray[np.uint8]
 NEXT = "_next"
 BATCH = 32
 
@@ -22,7 +25,7 @@ class StepLoop:
     def __init__(
         self,
         session: ort.InferenceSession,
-        features: Array,  # (N, P, C), input of the first tuned layer
+        features: Features,  # (N, P, C), input of the first tuned layer
         labels: Array,  # (N, 3)
         weights: Mapping[str, Array],  # weight{k}: (Co, K), bias{k}: (Co,)
         rates: Mapping[int, float],  # per tuned layer
@@ -30,8 +33,8 @@ class StepLoop:
         self._session = session
         self._rates = dict(rates)
         # Kept here, since bindings read these arrays' memory.
-        self._data = {
-            "features": np.ascontiguousarray(features, dtype=np.float32),
+        self._data: dict[str, NDArray[Any]] = {
+            "features": np.ascontiguousarray(features),
             "labels": np.ascontiguousarray(labels, dtype=np.float32),
             **{f"rate{k}": np.array(rate, dtype=np.float32) for k, rate in rates.items()},
         }

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from torch import nn
 
 from qsgm import bundle as bundles
+from qsgm.blocks import one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.crops import cut_crops, plan_crops
 from qsgm.images import write_png
+from qsgm.train.calibrate import float_trace
 from qsgm.train.fold import FoldedNet, FoldedSgm, fold_net, fold_sgm
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
-from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
+from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
 from qsgm.train.graspnet import CHANNELS, GraspNet, Loss, normalize
 from qsgm.train.quantize import QuantizedSgm, SgmRanges, quantize_sgm
@@ -33,8 +35,11 @@ torch.set_num_threads(1)
 settings.register_profile("qsgm", deadline=None, derandomize=True, database=None)
 settings.load_profile("qsgm")
 
-MOST_LAYERS = 3
-RATES = (0.002, 0.005, 0.02)
+MOST_LAYERS = 6
+BLOCKS = [single_layers(tuned) for tuned in range(1, MOST_LAYERS + 1)]
+BLOCKS += [parse_blocks(text) for text in ("4,5-6", "1-4,5,6")]
+WHOLE = [one_block(tuned) for tuned in range(1, MOST_LAYERS + 1)]
+RATES = (1e-4, 1e-4, 1e-3, 0.002, 0.005, 0.02)
 OPTIMIZERS: dict[bundles.OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
 
 
@@ -115,7 +120,7 @@ def write_bundle(folder: Path) -> None:
     """Every graph a bundle holds, and the manifest."""
     torch.manual_seed(0)
     net, loss = fold_net(_random_net()), Loss()
-    float_sgms = {layer: _random_sgm(layer) for layer in (4, 5)}
+    float_sgms = {layer: _random_sgm(layer) for layer in tuned_layers(MOST_LAYERS)[:-1]}
     int8_sgms = {layer: _quantized(sgm) for layer, sgm in float_sgms.items()}
     models = {bundles.NETWORK: network_model(net, loss.encoding)}
     for tuned in range(1, MOST_LAYERS + 1):
@@ -124,16 +129,13 @@ def write_bundle(folder: Path) -> None:
         if tuned > 1:
             probe = probe_model(net, tuned, float_sgms, int8_sgms, loss)
             models[bundles.probe_file(tuned)] = probe
-        for name, optimizer in OPTIMIZERS.items():
-            step = backprop_step_model(net, tuned, loss, optimizer)
-            models[bundles.step_file("bp", "float", name, tuned)] = step
-    precisions: list[tuple[bundles.Precision, dict[int, AnySgm]]] = [
-        ("float", dict(float_sgms)),
-        ("int8", dict(int8_sgms)),
-    ]
-    for (precision, sgms), name, tuned in product(precisions, OPTIMIZERS, (2, 3)):
-        step = step_model(net, tuned, sgms, loss, OPTIMIZERS[name])
-        models[bundles.step_file("sgm", precision, name, tuned)] = step
+    precisions: dict[bundles.Precision, dict[int, AnySgm]] = {
+        "float": dict(float_sgms),
+        "int8": dict(int8_sgms),
+    }
+    for precision, name, blocks in product(precisions, OPTIMIZERS, [*BLOCKS, *WHOLE]):
+        step = step_model(net, blocks, precisions[precision], loss, OPTIMIZERS[name])
+        models[bundles.step_file(precision, name, blocks)] = step
     for file, model in models.items():
         (folder / file).write_bytes(model.SerializeToString())
     (folder / bundles.MANIFEST).write_text(json.dumps(_manifest(folder, net, loss)))
@@ -143,9 +145,10 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
     offsets = initializer_offsets((folder / bundles.NETWORK).read_bytes())
     arrays = {f"weight{k}": layer.weight for k, layer in enumerate(net.layers, 1)}
     arrays |= {f"bias{k}": layer.bias for k, layer in enumerate(net.layers, 1)}
+    both = [*BLOCKS, *WHOLE]
     rates = {
-        "sgd": {str(n): RATES[-n:] for n in (1, 2, 3)},
-        "adam": {str(n): [1e-3] * n for n in (1, 2, 3)},
+        "sgd": {str(blocks): RATES[-len(blocks.layers) :] for blocks in both},
+        "adam": {str(blocks): [1e-3] * len(blocks.layers) for blocks in both},
     }
     return {
         "format": bundles.FORMAT,
@@ -153,6 +156,7 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
         "encoding": loss.encoding,
         "label_smoothing": loss.label_smoothing,
         "most_layers": MOST_LAYERS,
+        "blocks": [str(blocks) for blocks in BLOCKS],
         "recipes": {
             "sgm": {"optimizer": "sgd", "rates": rates},
             "bp": {"optimizer": "adam", "rates": rates},
@@ -191,9 +195,9 @@ def _random_sgm(layer: int) -> FoldedSgm:
 
 def _quantized(sgm: FoldedSgm) -> QuantizedSgm:
     """Ranges of activations up to 10, any label, and what the hidden layer makes of those."""
-    low = np.array([0.0] * CHANNELS[sgm.layer] + [0, -1, -1], np.float32)
-    high = np.array([10.0] * CHANNELS[sgm.layer] + [1, 1, 1], np.float32)
-    inputs = np.random.default_rng(0).uniform(low, high, (500, len(low)))
-    first = sgm.convs[0]
-    hidden = np.maximum(inputs @ first.weight[:, :, 0, 0].T + first.bias, 0).max(axis=0)
-    return quantize_sgm(sgm, SgmRanges(low, high, (hidden.astype(np.float32) + 1,)))
+    channels = CHANNELS[sgm.layer]
+    low = np.array([0.0] * channels + [0, -1, -1], np.float32)
+    high = np.array([10.0] * channels + [1, 1, 1], np.float32)
+    inputs = np.random.default_rng(0).uniform(low, high, (20, 25, len(low))).astype(np.float32)
+    _, (hidden,) = float_trace(sgm, inputs)
+    return quantize_sgm(sgm, SgmRanges(low, high, (hidden.max(axis=(0, 1)) + 1,)))

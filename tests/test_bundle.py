@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 
 from qsgm import QsgmError, load_bundle
+from qsgm.blocks import one_block, parse_blocks, single_layers
 from qsgm.bundle import (
     NETWORK,
     Bundle,
@@ -20,36 +22,46 @@ from qsgm.bundle import (
     probe_file,
     step_file,
     trunk_file,
-    tuned_layers,
 )
 from qsgm.finetuning import Settings, finetune
+
+BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", "4,5-6", "1-4,5,6"]
+STEP = step_file("int8", "sgd", single_layers(3))
 
 
 def test_a_whole_bundle_loads(bundle: Bundle) -> None:
     assert bundle.encoding == "double"
     assert 0 <= bundle.label_smoothing < 1
-    assert bundle.most_layers == 3
+    assert bundle.most_layers == 6
+    singles = ("6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6")
+    assert bundle.blocks == (*singles, "4,5-6", "1-4,5,6")
 
 
-def test_names_of_layers_and_steps() -> None:
-    assert list(tuned_layers(2)) == [5, 6]
-    assert step_file("sgm", "int8", "sgd", 3) == "step_sgm_int8_sgd_3.onnx"
-    assert step_file("bp", "float", "adam", 2) == "step_bp_adam_2.onnx"
-    # The last layer has its gradient from the loss: one layer needs no SGM.
-    assert step_file("sgm", "int8", "sgd", 1) == step_file("bp", "float", "sgd", 1)
+def test_names_of_steps() -> None:
+    assert step_file("int8", "sgd", single_layers(3)) == "step_int8_sgd_4,5,6.onnx"
+    assert step_file("float", "adam", parse_blocks("1-4,5,6")) == "step_float_adam_1-4,5,6.onnx"
+    # The last block has its gradient from the loss: a single one needs no SGM.
+    assert step_file("int8", "sgd", one_block(2)) == "step_float_sgd_5-6.onnx"
+    assert step_file("int8", "sgd", single_layers(1)) == "step_float_sgd_6.onnx"
 
 
-def test_sgms_stand_behind_all_tuned_layers_but_the_last(bundle: Bundle) -> None:
-    assert bundle.sgm_layers(3) == (4, 5)
-    assert bundle.sgm_layers(1) == ()
+def test_blocks_that_the_bundle_lacks_are_refused_with_those_it_has(bundle: Bundle) -> None:
+    for text in (*bundle.blocks, "4-6"):
+        bundle.check_blocks(parse_blocks(text))
+    with pytest.raises(QsgmError, match="no step for the blocks 4-5,6; choose one of 6 or 5,6 or"):
+        bundle.check_blocks(parse_blocks("4-5,6"))
+    small = replace(bundle, manifest=bundle.manifest | {"most_layers": 3})
+    with pytest.raises(QsgmError, match="3 layers at most, not 6; pass --layers 3"):
+        small.check_blocks(parse_blocks("1-4,5,6"))
 
 
 def test_a_recipe_has_a_rate_per_layer_and_its_own_optimizer(bundle: Bundle) -> None:
     assert bundle.recipe("sgm", 3, None).optimizer == "sgd"
     assert bundle.recipe("bp", 3, None).optimizer == "adam"
     assert bundle.recipe("bp", 2, "sgd").optimizer == "sgd"
-    for tuned in (1, 2, 3):
+    for tuned in range(1, 7):
         assert len(bundle.recipe("sgm", tuned, None).rates) == tuned
+    assert len(bundle.recipe("sgm", 6, None, parse_blocks("1-4,5,6")).rates) == 6
 
 
 def test_start_weights_are_those_in_the_network(bundle: Bundle) -> None:
@@ -126,7 +138,9 @@ def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> No
         load_bundle(own_bundle).session(trunk_file(3))
 
 
-@pytest.mark.parametrize("key", ["encoding", "files", "initializers", "recipes", "most_layers"])
+@pytest.mark.parametrize(
+    "key", ["encoding", "blocks", "files", "initializers", "recipes", "most_layers"]
+)
 def test_a_manifest_without_one_of_its_keys_is_refused_by_that_key(
     own_bundle: Path, key: str
 ) -> None:
@@ -165,20 +179,30 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("encoding",), "triple", "'encoding' is damaged: expected double or paper"),
         (("label_smoothing",), 1.0, "'label_smoothing' is damaged"),
         (("label_smoothing",), float("nan"), "'label_smoothing' is damaged"),
-        (("most_layers",), 0, "'most_layers' is damaged: expected 1 to 3"),
-        (("most_layers",), 6, "'most_layers' is damaged"),
+        (("most_layers",), 0, "'most_layers' is damaged: expected 1 to 6"),
+        (("most_layers",), 7, "'most_layers' is damaged"),
+        (("blocks",), [], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, "4,5,6"], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, "4,5"], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, "4-6"], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, "4,5-6,"], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, 6], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, []], "'blocks' is damaged"),
+        (("blocks",), BLOCKS[1:], "'blocks' is damaged"),
+        (("blocks",), [*BLOCKS, "4-5,6"], "'recipes' is damaged"),
         (("recipes",), {}, "'recipes' is damaged"),
         (("recipes", "bp"), [], "'recipes' is damaged"),
         (("recipes", "sgm", "optimizer"), "lion", "'recipes' is damaged"),
-        (("recipes", "sgm", "rates", "sgd", "3"), [0.1], "'recipes' is damaged"),
-        (("recipes", "sgm", "rates", "adam", "1"), [0.0], "'recipes' is damaged"),
-        (("recipes", "sgm", "rates", "adam", "1"), ["fast"], "'recipes' is damaged"),
-        (("recipes", "bp", "rates", "adam", "2"), [1e-3, float("inf")], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "sgd", "4,5,6"), [0.1], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "adam", "6"), [0.0], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "adam", "6"), ["fast"], "'recipes' is damaged"),
+        (("recipes", "bp", "rates", "adam", "5-6"), [1e-3, float("inf")], "'recipes' is damaged"),
         (("initializers", "bias6"), None, "'initializers' gives None for bias6"),
         (("initializers", "bias6", "shape"), [3, 1], "'initializers' gives"),
         (("initializers", "bias6", "shape"), ["3"], "'initializers' gives"),
         (("initializers", "weight4", "offset"), 10**9, "'initializers' gives"),
         (("initializers", "weight4", "offset"), -1, "'initializers' gives"),
+        (("initializers", "weight1"), None, "'initializers' gives None for weight1"),
     ],
 )
 def test_a_manifest_that_says_nonsense_is_refused_by_its_key(
@@ -192,7 +216,15 @@ def test_a_manifest_that_says_nonsense_is_refused_by_its_key(
 
 
 @pytest.mark.parametrize(
-    "name", [NETWORK, head_file(1), trunk_file(3), step_file("sgm", "float", "adam", 2)]
+    "name",
+    [
+        NETWORK,
+        head_file(1),
+        trunk_file(6),
+        step_file("float", "adam", single_layers(2)),
+        step_file("int8", "sgd", parse_blocks("1-4,5,6")),
+        step_file("float", "sgd", one_block(5)),
+    ],
 )
 def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
     own_bundle: Path, name: str
@@ -210,8 +242,8 @@ def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
         (trunk_file(3), trunk_file(1)),
         (trunk_file(3), head_file(3)),
         (head_file(3), head_file(1)),
-        (step_file("sgm", "int8", "sgd", 3), step_file("sgm", "int8", "sgd", 2)),
-        (step_file("sgm", "int8", "sgd", 3), trunk_file(3)),
+        (STEP, step_file("int8", "sgd", single_layers(2))),
+        (STEP, trunk_file(3)),
         (probe_file(3), head_file(3)),
     ],
 )
@@ -231,7 +263,7 @@ def test_another_graph_under_the_name_of_one_is_refused_when_it_runs(
 def test_one_layer_is_tuned_with_the_rates_of_the_method_asked_for(own_bundle: Path) -> None:
     path = own_bundle / "manifest.json"
     manifest = json.loads(path.read_text())
-    manifest["recipes"]["sgm"]["rates"]["sgd"]["1"] = [0.123]
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["6"] = [0.123]
     path.write_text(json.dumps(manifest))
     found = load_bundle(own_bundle)
     assert found.recipe("sgm", 1, None) == Recipe("sgd", (0.123,))

@@ -10,12 +10,14 @@ import pytest
 import torch
 
 from qsgm import QsgmError
+from qsgm.blocks import single_layers
 from qsgm.files import check_replaceable
 from qsgm.images import read_frame, write_png
 from qsgm.train import calibrate as module
 from qsgm.train.calibrate import (
     CalibrationSet,
     MinMax,
+    RunPlan,
     SgmObservers,
     Trainee,
     calibrate,
@@ -24,23 +26,25 @@ from qsgm.train.calibrate import (
     observe_frame,
     prepare,
     run,
+    run_plans,
 )
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
 from qsgm.train.draw_demo import draw_demo
-from qsgm.train.fold import FloatArray, run_folded_sgm
+from qsgm.train.fold import FloatArray, fold_sgm, run_folded_sgm
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.objects import TABLE_KINDS
 from qsgm.train.quantize import quantize_sgm
 from qsgm.train.sgm import Sgm
 
-RATES = {1: (1e-3,), 2: (1e-3, 1e-3), 3: (1e-3, 1e-3, 1e-3)}
+RATES = {str(single_layers(tuned)): (1e-3,) * tuned for tuned in (1, 2, 3)}
 EPOCHS = 1
 
 
 @pytest.fixture(autouse=True)
 def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CROPS", 70)
+    monkeypatch.setattr(module, "MAP_CROPS", 40)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trainee() -> Trainee:
     torch.manual_seed(0)
     sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
-    return prepare(Checkpoint(GraspNet().eval(), sgms, Loss(), RATES, {}))
+    return prepare(Checkpoint(GraspNet().eval(), sgms, {}, Loss(), RATES, {}))
 
 
 def ignore(_stage: str, _done: int, _of: int) -> None:
@@ -76,13 +80,17 @@ def test_min_max_sees_everything_in_any_order_and_grouping() -> None:
     assert (second.span()[0] <= kept).all()
 
 
-def test_the_float_trace_is_the_folded_sgm(trainee: Trainee) -> None:
-    seen = np.random.default_rng(1).normal(size=(9, 19)).astype(np.float32)
-    gradient, hidden = float_trace(trainee.sgms[4], seen)
-    activation, labels = torch.tensor(seen[:, :16, None, None]), torch.tensor(seen[:, 16:])
-    expected = run_folded_sgm(trainee.sgms[4], activation, labels)
-    np.testing.assert_allclose(gradient, expected.flatten(1), rtol=1e-5, atol=1e-6)
-    assert [tensor.shape for tensor in hidden] == [(9, 8), (9, 6)]
+@pytest.mark.parametrize(("layer", "side"), [(4, 1), (3, 7)])
+def test_the_float_trace_is_the_folded_sgm(layer: int, side: int) -> None:
+    torch.manual_seed(layer)
+    sgm = fold_sgm(Sgm(layer, (8, 6)).eval())
+    activation, labels = torch.randn(9, 16, side, side), torch.randn(9, 3)
+    filled = labels[:, None].expand(-1, side**2, -1)
+    seen = torch.cat([activation.flatten(2).transpose(1, 2), filled], dim=2)
+    gradient, hidden = float_trace(sgm, seen.numpy())
+    expected = run_folded_sgm(sgm, activation, labels).flatten(2).transpose(1, 2)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-6)
+    assert [tensor.shape for tensor in hidden] == [(9, side**2, 8), (9, side**2, 6)]
     assert min(tensor.min() for tensor in hidden) == 0
 
 
@@ -96,28 +104,30 @@ def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trai
 
     for i in range(2):
         for tuned in (2, 3):
-            steps = list(run(trainee, frames[i], tuned, [0, i], EPOCHS, gradient))
+            plan = RunPlan(tuned, 70, EPOCHS)
+            steps = list(run(trainee, frames[i], plan, [0, i], gradient))
             assert [len(moment.labels[0]) for moment in steps] == [32, 32, 6]
     stages: list[tuple[str, int, int]] = []
     ranges = calibrate(trainee, frames, 0, lambda *stage: stages.append(stage), EPOCHS)
     assert stages == [("calibrate", done, 2) for done in (0, 1, 2)]
     assert [len(batches) for batches in seen.values()] == [6, 12]
     for layer, batches in seen.items():
-        inputs = np.concatenate(batches)
+        inputs = np.concatenate(batches)[:, 0]
         np.testing.assert_array_equal(ranges[layer].input_low[:16], inputs[:, :16].min(axis=0))
         np.testing.assert_array_equal(ranges[layer].input_high[:16], inputs[:, :16].max(axis=0))
         np.testing.assert_array_equal(ranges[layer].input_low[16:], [0, -1, -1])
         np.testing.assert_array_equal(ranges[layer].input_high[16:], [1, 1, 1])
-        _, hidden = float_trace(trainee.sgms[layer], inputs)
+        _, hidden = float_trace(trainee.sgms[layer], inputs[:, None])
         for high, tensor in zip(ranges[layer].hidden_high, hidden, strict=True):
-            np.testing.assert_allclose(high, tensor.max(axis=0), rtol=1e-5)
+            np.testing.assert_allclose(high, tensor.max(axis=(0, 1)), rtol=1e-5)
 
 
 def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
     def gradient(layer: int, seen: FloatArray) -> FloatArray:
         return float_trace(trainee.sgms[layer], seen)[0]
 
-    first, *_, last = run(trainee, CalibrationSet(folder)[0], 3, [0], EPOCHS, gradient)
+    plan = RunPlan(3, 70, EPOCHS)
+    first, *_, last = run(trainee, CalibrationSet(folder)[0], plan, [0], gradient)
     for before, after in zip(first.states, last.states, strict=True):
         assert not torch.equal(before.weight, after.weight)
 
@@ -149,21 +159,62 @@ def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee
 
 def test_a_run_that_diverges_is_refused(folder: Path, trainee: Trainee) -> None:
     def gradient(_layer: int, seen: FloatArray) -> FloatArray:
-        return np.full((len(seen), 16), np.inf, np.float32)
+        return np.full((len(seen), 1, 16), np.inf, np.float32)
 
     with pytest.raises(QsgmError, match="fine-tuning 3 layers on a calibration frame diverged"):
-        list(run(trainee, CalibrationSet(folder)[0], 3, [0], EPOCHS, gradient))
+        list(run(trainee, CalibrationSet(folder)[0], RunPlan(3, 70, EPOCHS), [0], gradient))
 
 
-@pytest.mark.parametrize(
-    ("layers", "rates"), [((4,), RATES), ((4, 5, 3), RATES), ((4, 5), {1: (1e-3,), 3: (1e-3,)})]
-)
-def test_a_checkpoint_for_other_layers_is_refused(
-    layers: tuple[int, ...], rates: dict[int, tuple[float, ...]]
-) -> None:
-    sgms = {layer: Sgm(layer) for layer in layers}
-    with pytest.raises(QsgmError, match=r"expected \[4, 5\] and \{1: 1, 2: 2, 3: 3\}"):
-        prepare(Checkpoint(GraspNet(), sgms, Loss(), rates, {}))
+def test_sgms_ahead_of_the_last_three_layers_get_a_short_run_of_all_layers() -> None:
+    assert run_plans(2, 40) == [RunPlan(2, 70, 40)]
+    assert run_plans(3, 40) == [RunPlan(2, 70, 40), RunPlan(3, 70, 40)]
+    *whole, short = run_plans(6, 40)
+    assert whole == run_plans(3, 40)
+    assert (short.tuned, short.crops) == (6, 40)
+    assert short.epochs < 40
+    assert [[*plan.measured] for plan in (*whole, short)] == [[5], [4, 5], [1, 2, 3]]
+    assert [*RunPlan(4, 40, 1).measured] == [3]
+
+
+def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) -> None:
+    torch.manual_seed(0)
+    sgms = {layer: Sgm(layer, (8,)).eval() for layer in (2, 3, 4, 5)}
+    for sgm in sgms.values():  # untrained as they are, keep them from running away
+        torch.nn.init.normal_(sgm.convs[-1].weight, std=1e-4)
+    rates = {str(single_layers(tuned)): (1e-4,) * tuned for tuned in range(1, 6)}
+    of_five = prepare(Checkpoint(GraspNet().eval(), sgms, {}, Loss(), rates, {}))
+    frames = CalibrationSet(folder)
+    ranges = calibrate(of_five, frames, 0, ignore, EPOCHS)
+    whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS)
+    for layer in (4, 5):  # as if there were no others
+        np.testing.assert_array_equal(ranges[layer].input_high, whole[layer].input_high)
+    seen: dict[int, list[FloatArray]] = {layer: [] for layer in of_five.sgms}
+
+    def gradient(layer: int, inputs: FloatArray) -> FloatArray:
+        seen[layer].append(inputs)
+        return float_trace(of_five.sgms[layer], inputs)[0]
+
+    for i in range(2):
+        list(run(of_five, frames[i], run_plans(5, EPOCHS)[-1], [0, i], gradient))
+    for layer, positions in ((2, 29**2), (3, 13**2)):
+        inputs = np.concatenate(seen[layer])
+        assert inputs.shape[1] == positions
+        high = inputs.max(axis=(0, 1))[:-3]
+        np.testing.assert_array_equal(ranges[layer].input_high[:-3], high)
+    int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in of_five.sgms.items()}
+    fidelity = measure(of_five, int8, frames, 0, ignore, EPOCHS)
+    assert set(fidelity) == {2, 3, 4, 5}
+    for layer in (2, 3):
+        assert fidelity[layer].cos_int8_float > 0.999
+        assert fidelity[layer].clipped_fraction < 1e-3
+
+
+def of_three(trainee: Trainee) -> Trainee:
+    """The same checkpoint without the SGMs behind layers 1 to 3."""
+    whole = trainee.checkpoint
+    sgms = {layer: whole.sgms[layer] for layer in (4, 5)}
+    rates = {str(single_layers(n)): whole.rates[str(single_layers(n))] for n in (1, 2, 3)}
+    return prepare(Checkpoint(whole.net, sgms, {}, whole.loss, rates, {}))
 
 
 def test_a_drawn_set_is_the_same_twice_and_replaces_itself(folder: Path, tmp_path: Path) -> None:

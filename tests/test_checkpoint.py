@@ -20,8 +20,9 @@ from qsgm.train.sgm import Sgm
 def checkpoint() -> Checkpoint:
     torch.manual_seed(0)
     sgms = {4: Sgm(4, (8, 8)).eval(), 5: Sgm(5).eval()}
-    rates = {1: (0.03,), 2: (0.01, 0.03), 3: (0.005, 0.001, 0.003)}
-    return Checkpoint(GraspNet().eval(), sgms, Loss(label_smoothing=0.1), rates, {"seed": 0})
+    rates = {"6": (0.03,), "5,6": (0.01, 0.03), "4,5,6": (0.005, 0.001, 0.003)}
+    rates["4,5-6"] = (0.02, 0.001, 0.004)
+    return Checkpoint(GraspNet().eval(), sgms, {}, Loss(label_smoothing=0.1), rates, {"seed": 0})
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Checkpoint) -> None:
@@ -37,6 +38,9 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Che
     for mine, theirs in ((back.net, checkpoint.net), (back.sgms[4], checkpoint.sgms[4])):
         for name, value in theirs.state_dict().items():
             assert torch.equal(mine.state_dict()[name], value)
+
+
+GOOD_RATES = {"6": [0.1], "5,6": [0.1, 0.1], "4,5,6": [0.1, 0.1, 0.1]}
 
 
 def refuse(path: Path) -> str:
@@ -91,6 +95,7 @@ def test_someone_elses_checkpoint_is_refused(tmp_path: Path) -> None:
     [
         ("net", {}),
         ("sgms", {9: {}}),
+        ("sgms", {}),
         ("hidden", {4: [7, 7], 5: [16]}),
         ("rates", "fast"),
         ("card", "{"),
@@ -157,17 +162,20 @@ def test_a_loss_that_cannot_be_is_refused(
 @pytest.mark.parametrize(
     "rates",
     [
-        {1: [0.1], 2: [0.1, 0.1]},
-        {1: [0.1], 2: [0.1, 0.1], 3: [0.1, 0.1]},
-        {1: [0.1], 2: [0.1, 0.1], 3: [0.1, 0.1, 0.0]},
-        {1: [-0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {1: [float("nan")], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {1: [float("inf")], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {1: [10**400], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {1: ["0.1"], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {0: [], 1: [0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {"1": [0.1], 2: [0.1, 0.1], 3: [0.1] * 3},
-        {1: 0.1, 2: [0.1, 0.1], 3: [0.1] * 3},
+        {"6": [0.1], "5,6": [0.1, 0.1]},
+        GOOD_RATES | {"4,5,6": [0.1, 0.1]},
+        GOOD_RATES | {"4,5,6": [0.1, 0.1, 0.0]},
+        GOOD_RATES | {"6": [-0.1]},
+        GOOD_RATES | {"6": [float("nan")]},
+        GOOD_RATES | {"6": [float("inf")]},
+        GOOD_RATES | {"6": [10**400]},
+        GOOD_RATES | {"6": ["0.1"]},
+        GOOD_RATES | {"6": 0.1},
+        GOOD_RATES | {"": []},
+        GOOD_RATES | {1: [0.1]},
+        GOOD_RATES | {"4,5": [0.1, 0.1]},
+        GOOD_RATES | {"4-5,6": [0.1, 0.1]},
+        GOOD_RATES | {"3,4,5,6": [0.1] * 4},
     ],
 )
 def test_rates_that_cannot_be_are_refused(
@@ -177,6 +185,21 @@ def test_rates_that_cannot_be_are_refused(
     save_checkpoint(path, checkpoint)
     torch.save(torch.load(path, weights_only=True) | {"rates": rates}, path)
     assert "does not fit" in refuse(path)
+
+
+@pytest.mark.parametrize("layers", [(4,), (3, 4, 5), (3, 5), (1, 2, 3, 4, 5)])
+def test_sgms_and_rates_of_other_layers_do_not_go_together(layers: tuple[int, ...]) -> None:
+    sgms = {layer: Sgm(layer) for layer in layers}
+    rates = {text: tuple(values) for text, values in GOOD_RATES.items()}
+    with pytest.raises(ValueError, match=r"SGMs stand behind|no rates for layers 3,4,5,6"):
+        Checkpoint(GraspNet(), sgms, {}, Loss(), rates, {})
+
+
+def test_the_number_of_layers_that_can_be_tuned_is_that_of_the_sgms_and_the_last(
+    checkpoint: Checkpoint,
+) -> None:
+    assert checkpoint.most_layers == 3
+    assert Checkpoint(checkpoint.net, {}, {}, Loss(), {"6": (0.1,)}, {}).most_layers == 1
 
 
 def test_a_small_file_that_unpacks_to_a_large_one_is_refused_unread(

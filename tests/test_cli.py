@@ -327,6 +327,39 @@ def test_a_wrong_number_of_frames_is_a_usage_error(qsgm: Run, arguments: tuple[s
     assert_refused(qsgm("finetune", *arguments), 2)
 
 
+def test_blocks_say_how_many_layers_to_tune(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    outcome = qsgm(
+        "finetune", "--json", "--epochs", 0, "--blocks", "4,5-6", "--layers", 3, "--bundle",
+        bundle_folder, "-o", tmp_path / "bar", frame_path,
+    )  # fmt: skip
+    assert (outcome.json["layers"], outcome.json["blocks"]) == (3, "4,5-6")
+    assert set(outcome.json["fidelity"]) == {"4"}
+    shown = qsgm(
+        "finetune", "--epochs", 0, "--blocks", "4,5-6", "--bundle", bundle_folder, "-o",
+        tmp_path / "bar", frame_path,
+    )  # fmt: skip
+    assert "bar: blocks 4,5-6, sgm int8" in shown.out
+
+
+def test_blocks_that_are_none_or_contradict_the_layers_are_a_usage_error(
+    qsgm: Run, frame_path: Path, bundle_folder: Path
+) -> None:
+    command = ("finetune", "--bundle", bundle_folder, frame_path)
+    assert_refused(qsgm(*command, "--blocks", "4,6"), 2, "--blocks", "expected every layer")
+    contradiction = qsgm(*command, "--blocks", "4,5-6", "--layers", 2)
+    assert_refused(contradiction, 2, "--blocks", "4,5-6 is 3 layers, but --layers says 2")
+    assert_refused(qsgm("fold-and-quantize", "sgm.pt", "--blocks", "7"), 2, "--blocks")
+
+
+def test_blocks_that_the_bundle_lacks_are_refused_with_those_it_has(
+    qsgm: Run, frame_path: Path, bundle_folder: Path
+) -> None:
+    outcome = qsgm("finetune", "--bundle", bundle_folder, "--blocks", "4-5,6", frame_path)
+    assert_refused(outcome, 1, "no step for the blocks 4-5,6; choose one of 6 or 5,6 or 4,5,6")
+
+
 def test_an_unknown_command_is_a_usage_error(qsgm: Run) -> None:
     assert_refused(qsgm("fine-tune"), 2, "fine-tune", "see `qsgm --help`")
 

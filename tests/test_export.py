@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 
 from qsgm import QsgmError
+from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, Recipe, load_bundle
 from qsgm.train import calibrate, export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
@@ -27,16 +28,17 @@ from qsgm.tuned import ObjectDescription, save_object
 from qsgm.tuning import StepLoop
 from qsgm.weights import to_step_layout
 
-RATES = {1: (4e-3,), 2: (2e-3, 3e-3), 3: (1e-3, 2e-3, 3e-3)}
+RATES = {"6": (4e-3,), "5,6": (2e-3, 3e-3), "4,5,6": (1e-3, 2e-3, 3e-3)}
+RATES["4-5,6"] = (5e-3, 6e-3, 7e-3)
 GRAPHS = {
     "network.onnx",
     *(f"{kind}_{n}.onnx" for kind in ("trunk", "head") for n in (1, 2, 3)),
-    *(f"step_bp_{optimizer}_{n}.onnx" for optimizer in ("sgd", "adam") for n in (1, 2, 3)),
+    *(f"step_float_{name}_{b}.onnx" for name in ("sgd", "adam") for b in ("6", "5-6", "4-6")),
     *(
-        f"step_sgm_{precision}_{optimizer}_{n}.onnx"
+        f"step_{precision}_{optimizer}_{blocks}.onnx"
         for precision in ("int8", "float")
         for optimizer in ("sgd", "adam")
-        for n in (2, 3)
+        for blocks in ("5,6", "4,5,6", "4,5-6", "4-5,6")
     ),
     "probe_2.onnx",
     "probe_3.onnx",
@@ -64,13 +66,13 @@ class Workplace:
         torch.manual_seed(0)
         self.net = GraspNet().eval()
         sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
-        self.checkpoint = Checkpoint(self.net, sgms, Loss(), RATES, {"seed": 11})
+        self.checkpoint = Checkpoint(self.net, sgms, {}, Loss(), RATES, {"seed": 11})
         save_checkpoint(folder / "sgm.pt", self.checkpoint)
         draw_calibration_set(folder / "calib", count=2, seed=5)
 
     def export(self, name: str) -> ExportReport:
         paths = (self.folder / part for part in ("sgm.pt", "calib", name))
-        return fold_and_quantize(*paths, ignore, epochs=1)
+        return fold_and_quantize(*paths, ignore, epochs=1, blocks=[parse_blocks("4-5,6")])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -110,11 +112,16 @@ def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
 
 def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:
     assert (bundle.encoding, bundle.label_smoothing, bundle.most_layers) == ("double", 0.05, 3)
-    for tuned in (2, 3):
-        assert bundle.recipe("sgm", tuned, None).optimizer == "sgd"
-        assert bundle.recipe("sgm", tuned, None).rates == RATES[tuned]
-        assert bundle.recipe("sgm", tuned, "adam").rates == (3e-4,) * tuned
-    assert bundle.recipe("sgm", 1, None) == Recipe("sgd", RATES[1])
+    assert bundle.blocks == ("6", "5,6", "4,5,6", "4,5-6", "4-5,6")
+    for text in ("5,6", "4,5,6", "4-5,6"):
+        blocks = parse_blocks(text)
+        tuned = len(blocks.layers)
+        assert bundle.recipe("sgm", tuned, None, blocks) == Recipe("sgd", RATES[text])
+        assert bundle.recipe("sgm", tuned, "adam", blocks).rates == (3e-4,) * tuned
+    # Without rates of their own, blocks get those of as many layers on their own.
+    assert bundle.recipe("sgm", 3, None, parse_blocks("4,5-6")).rates == RATES["4,5,6"]
+    assert bundle.recipe("sgm", 3, None).rates == RATES["4,5,6"]
+    assert bundle.recipe("sgm", 1, None) == Recipe("sgd", RATES["6"])
     assert bundle.recipe("bp", 1, None) == Recipe("adam", (1e-3,))
     assert bundle.recipe("bp", 3, None).rates == (1e-3,) * 3
     assert bundle.recipe("bp", 3, "sgd").rates == (1e-2,) * 3
@@ -133,9 +140,10 @@ def test_start_weights_are_the_folded_checkpoints(workplace: Workplace, bundle: 
 
 @pytest.mark.parametrize("precision", ["int8", "float"])
 @pytest.mark.parametrize("optimizer", ["sgd", "adam"])
-@pytest.mark.parametrize("tuned", [2, 3])
-def test_exported_steps_train(bundle: Bundle, tuned: int, optimizer: str, precision: str) -> None:
-    session = bundle.session(f"step_sgm_{precision}_{optimizer}_{tuned}.onnx")
+@pytest.mark.parametrize("blocks", ["5,6", "4,5,6", "4-5,6"])
+def test_exported_steps_train(bundle: Bundle, blocks: str, optimizer: str, precision: str) -> None:
+    session = bundle.session(f"step_{precision}_{optimizer}_{blocks}.onnx")
+    tuned = len(parse_blocks(blocks).layers)
     rng = np.random.default_rng(0)
     features = rng.random((40, 169 if tuned == 3 else 1, 16), np.float32)
     labels = rng.uniform(0, 1, (40, 3)).astype(np.float32)
@@ -208,6 +216,19 @@ def test_a_missing_or_altered_graph_is_refused(
     assert workplace.folder.is_dir()
 
 
+@pytest.mark.parametrize("text", ["3,4-5,6", "4-6", "6"])
+def test_blocks_without_their_sgms_are_refused(text: str) -> None:
+    with pytest.raises(QsgmError, match=f"cannot export steps for the blocks {text}: .* 3 layers"):
+        export.exported_blocks(3, [parse_blocks(text)])
+
+
+def test_a_checkpoint_of_six_layers_exports_all_of_them() -> None:
+    texts = [str(blocks) for blocks in export.exported_blocks(6, [])]
+    assert texts[:6] == [str(single_layers(tuned)) for tuned in range(1, 7)]
+    assert texts[6:] == ["4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6"]
+    assert [str(blocks) for blocks in export.exported_blocks(1, [])] == ["6"]
+
+
 def test_a_failure_leaves_nothing_behind(
     workplace: Workplace, report: ExportReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,7 +264,7 @@ def test_folding_that_changes_outputs_is_refused(workplace: Workplace) -> None:
 
 
 def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> None:
-    model = onnx.load(bundle.folder / "step_sgm_int8_sgd_3.onnx")
+    model = onnx.load(bundle.folder / "step_int8_sgd_4,5,6.onnx")
     refuse_float_products("step", model)
     # ONNX Runtime has no integer product with a factor on its sum and a bias.
     gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][3]

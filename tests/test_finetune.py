@@ -3,15 +3,17 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm import QsgmError, finetune, load_bundle, load_object
+from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object
 from qsgm.angles import encode_angle
-from qsgm.bundle import Bundle, head_file, step_file
+from qsgm.blocks import parse_blocks, single_layers
+from qsgm.bundle import Bundle, head_file
 from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
 from qsgm.finetuning import (
     Accuracy,
@@ -107,13 +109,97 @@ def test_every_method_tunes_every_number_of_layers(
 ) -> None:
     settings = Settings(method=method, layers=layers, epochs=1)  # type: ignore[arg-type]
     result = finetune(frame, bundle, settings)
-    assert set(result.fidelity) == set(bundle.sgm_layers(layers))
+    assert set(result.fidelity) == set(single_layers(layers).sgm_layers)
+    assert (
+        str(result.blocks)
+        == {
+            "sgm": ["6", "5,6", "4,5,6"],
+            "bp": ["6", "5-6", "4-6"],
+        }[method][layers - 1]
+    )
     assert len(result.probes) == (2 if layers > 1 else 0)
     start = bundle.start_weights(layers)
     assert set(result.weights) == set(start)
     assert all(result.weights[name].shape == start[name].shape for name in start)
     assert any(not np.array_equal(result.weights[name], start[name]) for name in start)
     assert result.settings.precision == ("float" if method == "bp" else "int8")
+
+
+@pytest.fixture
+def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers 1 to 3 see large maps."""
+    monkeypatch.setattr(finetuning, "TRAIN_CROPS", 64)
+    monkeypatch.setattr(finetuning, "plan_crops", partial(plan_crops, count=96))
+
+
+@pytest.mark.usefixtures("few_crops")
+@pytest.mark.parametrize(
+    ("settings", "probed"),
+    [
+        (Settings(layers=6, epochs=1), {1, 2, 3, 4, 5}),
+        (Settings(layers=6, blocks="1-4,5,6", epochs=1), {4, 5}),
+        (Settings(layers=6, method="bp", epochs=1), {1, 2, 3, 4, 5}),
+        (Settings(layers=5, precision="float", epochs=1), {2, 3, 4, 5}),
+        (Settings(layers=4, epochs=1), {3, 4, 5}),
+        (Settings(layers=3, blocks="4,5-6", epochs=1), {4}),
+    ],
+)
+def test_all_layers_can_be_tuned_alone_or_in_blocks(
+    frame: Frame, bundle: Bundle, settings: Settings, probed: set[int]
+) -> None:
+    result = finetune(frame, bundle, settings)
+    assert set(result.fidelity) == probed
+    assert result.prepared.features.dtype == (np.uint8 if settings.layers == 6 else np.float32)
+    start = bundle.start_weights(settings.layers)
+    assert set(result.weights) == set(start)
+    for name, value in start.items():
+        assert not np.array_equal(result.weights[name], value), name
+
+
+@pytest.mark.usefixtures("few_crops")
+def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
+    frame: Frame, bundle: Bundle, tmp_path: Path
+) -> None:
+    result = finetune(frame, bundle, Settings(layers=6, epochs=1))
+    untouched = finetune(frame, bundle, Settings(layers=6, epochs=0))
+    assert untouched.network() == (bundle.folder / "network.onnx").read_bytes()
+    result.save(tmp_path / "mug", "mug")
+    tuned = load_object(tmp_path / "mug")
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 96)
+    crops = cut_crops(frame, plan[:5])
+    np.testing.assert_array_equal(result.prepared.features[:5].reshape(crops.shape), crops)
+    weights = {
+        name: to_step_layout(value) if value.ndim > 1 else value
+        for name, value in result.weights.items()
+    }
+    head = bundle.session(head_file(6))
+    expected = head.run(None, {"features": result.prepared.features[:5], **weights})[0]
+    got = np.stack([tuned.heatmap(crop)[:, 0, 0] for crop in crops])
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (Settings(layers=6, blocks="1-3,4,5,6"), "no step for the blocks 1-3,4,5,6; choose one of"),
+        (Settings(blocks="1-4,5,6"), "are the last 6 layers, the settings say 3"),
+        (Settings(blocks="4-6"), "leave no place for an SGM: pass --method bp"),
+        (Settings(blocks="4,5-6", method="bp"), "trains all layers as one block, 4-6"),
+        (Settings(blocks="4,6"), "gives no blocks of layers"),
+    ],
+)
+def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
+    frame: Frame, bundle: Bundle, settings: Settings, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(finetuning, "plan_crops", pytest.fail)
+    with pytest.raises(QsgmError, match=said) as raised:
+        finetune(frame, bundle, settings)
+    assert "\n" not in str(raised.value)
+
+
+def test_backpropagation_may_be_asked_for_by_its_one_block(frame: Frame, bundle: Bundle) -> None:
+    asked = finetune(frame, bundle, Settings(method="bp", blocks="4-6", epochs=1))
+    assert asked.network() == finetune(frame, bundle, Settings(method="bp", epochs=1)).network()
 
 
 def test_backpropagation_lowers_the_loss(frame: Frame, bundle: Bundle) -> None:
@@ -198,7 +284,7 @@ def test_training_that_diverges_names_the_step_and_what_to_do(
 ) -> None:
     path = own_bundle / "manifest.json"
     manifest = json.loads(path.read_text())
-    manifest["recipes"]["sgm"]["rates"]["sgd"]["3"] = [1e30, 1e30, 1e30]
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["4,5,6"] = [1e30, 1e30, 1e30]
     path.write_text(json.dumps(manifest))
     with pytest.raises(QsgmError, match=r"diverged: .* at step \d+; nothing .* another --method"):
         finetune(frame, load_bundle(own_bundle), SHORT)
@@ -230,13 +316,23 @@ def test_an_object_unlike_the_calibration_set_is_named(result: FinetuneResult) -
 
 
 def test_activations_are_counted_as_documented() -> None:
-    last_three = [4 * 32 * n for n in (16 * 51, 32, 3)]
-    assert peak_activation_bytes(3) == {"sgm": last_three[0], "backprop": sum(last_three)}
-    assert peak_activation_bytes(1) == {"sgm": 4 * 32 * 3, "backprop": 4 * 32 * 3}
+    maps = [8 * 62 * 62, 8 * 29 * 29, 16 * 13 * 13, 16 * 5 * 5, 16, 0]
+    pooled = [0, 0, 0, 16, 0, 3]
+    layers = [4 * 32 * (2 * one + rest) for one, rest in zip(maps, pooled, strict=True)]
+
+    def peak(text: str) -> list[int]:
+        values = peak_activation_bytes(parse_blocks(text))
+        return [values["sgm"], values["backprop"]]
+
+    assert peak("6") == [layers[5], layers[5]]
+    assert peak("4,5,6") == [layers[3], sum(layers[3:])]
+    assert peak("4-5,6") == [sum(layers[3:5]), sum(layers[3:])]
+    assert peak("1,2,3,4,5,6") == [layers[0], sum(layers)]
+    assert peak("2-4,5,6") == [sum(layers[1:4]), sum(layers[1:])]
+    assert peak("1-6") == [sum(layers), sum(layers)]
 
 
 def test_int8_and_float_sgms_run_different_graphs(frame: Frame, bundle: Bundle) -> None:
-    assert step_file("sgm", "int8", "sgd", 3) != step_file("sgm", "float", "sgd", 3)
     prepared = prepare(frame, bundle, SHORT)
     floating = train(prepared, replace(SHORT, precision="float")).weights["weight4"]
     integers = train(prepared, SHORT).weights["weight4"]

@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from qsgm import QsgmError
-from qsgm.train.fold import fold_net, fold_sgm, net_fold_error, run_folded, sgm_fold_error
+from qsgm.train.fold import (
+    fold_net,
+    fold_sgm,
+    net_fold_error,
+    on_pixels,
+    run_folded,
+    sgm_fold_error,
+)
 from qsgm.train.graspnet import CHANNELS, GraspNet, normalize
 from qsgm.train.sgm import Sgm
 
@@ -37,13 +45,28 @@ def random_crops(seed: int, count: int = 4) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_folded_network_on_raw_pixels_equals_the_unfolded_one(seed: int) -> None:
+def test_folded_network_equals_the_unfolded_one(seed: int) -> None:
     net, crops = shaken_net(seed), random_crops(seed)
     with torch.no_grad():
         expected = net(normalize(crops))
         got = run_folded(fold_net(net), crops)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
     assert net_fold_error(net, fold_net(net), crops) == float((got - expected).abs().max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_layer_can_take_raw_pixels(seed: int) -> None:
+    net, crops = shaken_net(seed), random_crops(seed)
+    folded = fold_net(net)
+    on_raw = on_pixels(folded)
+    assert on_raw.layers[1:] == folded.layers[1:]
+    weight, bias = (
+        torch.tensor(array) for array in (on_raw.layers[0].weight, on_raw.layers[0].bias)
+    )
+    got = F.relu(F.conv2d(crops.permute(0, 3, 1, 2).float(), weight, bias, stride=2))
+    with torch.no_grad():
+        expected = net.between(normalize(crops), 1, 1)
+    torch.testing.assert_close(got, expected, rtol=1e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize("layer", range(1, 6))

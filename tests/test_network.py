@@ -41,13 +41,16 @@ def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray
     return run(head_model(net, tuned, "double").SerializeToString(), **feeds)
 
 
-@pytest.mark.parametrize(("last_frozen", "positions"), [(3, 169), (4, 1), (5, 1)])
-def test_trunk_equals_torch(net: GraspNet, last_frozen: int, positions: int) -> None:
+@pytest.mark.parametrize(
+    ("last_frozen", "positions", "channels"),
+    [(1, 3844, 8), (2, 841, 8), (3, 169, 16), (4, 1, 16), (5, 1, 16)],
+)
+def test_trunk_equals_torch(net: GraspNet, last_frozen: int, positions: int, channels: int) -> None:
     crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
     got = run(trunk_model(fold_net(net), last_frozen).SerializeToString(), crops=crops)
     with torch.no_grad():
         maps = net.between(normalize(torch.tensor(crops)), 1, last_frozen)
-    assert got.shape == (5, positions, 16)
+    assert got.shape == (5, positions, channels)
     expected = maps.flatten(2).transpose(1, 2).numpy()
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
@@ -64,7 +67,14 @@ def test_network_on_a_frame_equals_torch(
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("tuned", [1, 2, 3])
+def test_where_nothing_is_frozen_the_trunk_leaves_pixels_as_they_are(net: GraspNet) -> None:
+    crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
+    got = run(trunk_model(fold_net(net), 0).SerializeToString(), crops=crops)
+    assert got.dtype == np.uint8
+    np.testing.assert_array_equal(got, crops.reshape(5, 128 * 128, 3))
+
+
+@pytest.mark.parametrize("tuned", range(1, 7))
 def test_every_cell_equals_trunk_and_head_on_its_window(
     net: GraspNet, frame: np.ndarray, tuned: int
 ) -> None:

@@ -16,7 +16,11 @@ from qsgm import QsgmError
 from qsgm.runtime import session_options
 from qsgm.train.fold import FloatArray, FoldedConv, FoldedSgm
 from qsgm.train.graphs.build import Graph
-from qsgm.train.graphs.inspection import integer_operators, optimized_nodes
+from qsgm.train.graphs.inspection import (
+    integer_operators,
+    optimized_nodes,
+    refuse_float_products,
+)
 from qsgm.train.graphs.sgm import clipped_fraction, int8_sgm, scaled_inputs
 from qsgm.train.quantize import (
     QuantizedSgm,
@@ -26,48 +30,62 @@ from qsgm.train.quantize import (
     quantize_product,
     quantize_sgm,
     to_u8,
+    with_zero,
 )
 
 ALL, NONE = ort.GraphOptimizationLevel.ORT_ENABLE_ALL, ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 
 
 DEPTHS = pytest.mark.parametrize("hidden", [(16,), (64, 64), (12, 20, 8)])
+KERNELS = pytest.mark.parametrize(("kernel", "side"), [(1, 1), (3, 5)], ids=["1x1", "3x3"])
 
 
-def random_conv(rng: np.random.Generator, into: int, out: int) -> FoldedConv:
-    weight, bias = rng.normal(size=(out, into, 1, 1)), rng.normal(size=out)
-    return FoldedConv(weight.astype(np.float32), bias.astype(np.float32))
+def random_sgm(rng: np.random.Generator, channels: int, *hidden: int, kernel: int = 1) -> FoldedSgm:
+    widths, convs = (channels + 3, *hidden, channels), []
+    for into, out in pairwise(widths):
+        weight, bias = rng.normal(size=(out, into, kernel, kernel)), rng.normal(size=out)
+        convs.append(FoldedConv(weight.astype(np.float32) / kernel, bias.astype(np.float32)))
+    return FoldedSgm(4 if kernel == 1 else 2, tuple(convs))
 
 
-def random_sgm(rng: np.random.Generator, channels: int, *hidden: int) -> FoldedSgm:
-    widths = (channels + 3, *hidden, channels)
-    return FoldedSgm(4, tuple(random_conv(rng, into, out) for into, out in pairwise(widths)))
-
-
-def random_inputs(rng: np.random.Generator, sgm: FoldedSgm, rows: int) -> FloatArray:
-    """Activations of very different size per channel, then labels in [-1, 1]."""
+def random_inputs(
+    rng: np.random.Generator, sgm: FoldedSgm, rows: int, positions: int = 1
+) -> FloatArray:
+    """Activations of very different size per channel, then labels in [-1, 1] of each row."""
     channels = len(sgm.convs[-1].bias)
-    activation = np.exp(rng.normal(size=channels)) * np.abs(rng.normal(size=(rows, channels)))
-    labels = rng.uniform(-1, 1, (rows, 3))
-    return np.concatenate([activation, labels], axis=1).astype(np.float32)
+    spread = np.exp(rng.normal(size=channels))
+    activation = spread * np.abs(rng.normal(size=(rows, positions, channels)))
+    labels = rng.uniform(-1, 1, (rows, 1, 3)).repeat(positions, axis=1)
+    return np.concatenate([activation, labels], axis=2).astype(np.float32)
+
+
+def float_product(conv: FoldedConv, x: FloatArray) -> FloatArray:
+    """A padded convolution of square maps (N, P, I), tap by tap: (N, P, O)."""
+    count, positions, _ = x.shape
+    side, kernel = round(positions**0.5), conv.weight.shape[2]
+    pad = kernel // 2
+    maps = np.pad(x.reshape(count, side, side, -1), ((0, 0), (pad, pad), (pad, pad), (0, 0)))
+    total = np.broadcast_to(conv.bias, (count, side, side, len(conv.bias)))
+    for dy, dx in np.ndindex(kernel, kernel):
+        total = total + maps[:, dy : dy + side, dx : dx + side] @ conv.weight[:, :, dy, dx].T
+    return total.reshape(count, positions, -1)
 
 
 def float_hidden(sgm: FoldedSgm, inputs: FloatArray) -> list[FloatArray]:
     """Every hidden tensor, behind its ReLU."""
     tensors = [inputs]
     for conv in sgm.convs[:-1]:
-        tensors.append(np.maximum(tensors[-1] @ conv.weight[:, :, 0, 0].T + conv.bias, 0))
+        tensors.append(np.maximum(float_product(conv, tensors[-1]), 0))
     return tensors[1:]
 
 
 def float_gradient(sgm: FoldedSgm, inputs: FloatArray) -> FloatArray:
-    last = sgm.convs[-1]
-    return float_hidden(sgm, inputs)[-1] @ last.weight[:, :, 0, 0].T + last.bias
+    return float_product(sgm.convs[-1], [inputs, *float_hidden(sgm, inputs)][-1])
 
 
 def seen_ranges(sgm: FoldedSgm, inputs: FloatArray) -> SgmRanges:
-    hidden = tuple(tensor.max(axis=0) for tensor in float_hidden(sgm, inputs))
-    return SgmRanges(inputs.min(axis=0), inputs.max(axis=0), hidden)
+    hidden = tuple(tensor.max(axis=(0, 1)) for tensor in float_hidden(sgm, inputs))
+    return SgmRanges(inputs.min(axis=(0, 1)), inputs.max(axis=(0, 1)), hidden)
 
 
 def gradient_of_rounded_activations(
@@ -77,22 +95,23 @@ def gradient_of_rounded_activations(
     x = q.input_low + to_u8((inputs - q.input_low) * q.input_gain) / q.input_gain
     for conv, high in zip(sgm.convs, ranges.hidden_high, strict=False):
         step = np.where(high > 0, high, 1) / 255
-        x = step * to_u8((x @ conv.weight[:, :, 0, 0].T + conv.bias) / step)
-    last = sgm.convs[-1]
-    return x @ last.weight[:, :, 0, 0].T + last.bias
+        x = step * to_u8(float_product(conv, x) / step)
+    return float_product(sgm.convs[-1], x)
 
 
-def int8_model(q: QuantizedSgm) -> onnx.ModelProto:
+def int8_model(q: QuantizedSgm, side: int = 1) -> onnx.ModelProto:
     """Inputs to gradient, clipped fraction and the u8 hidden tensors."""
     inputs, channels = len(q.input_low), len(q.products[-1].bias)
     graph = Graph("int8")
-    op = graph.within("sgm")
-    scaled = scaled_inputs(op, q, graph.input("inputs", np.float32, ("batch", inputs)))
-    graph.output("gradient", int8_sgm(op, q, scaled), np.float32, ("batch", channels))
-    graph.output("clipped", clipped_fraction(op, scaled), np.float32, ())
+    op = graph.within("layer2")
+    seen = graph.input("inputs", np.float32, ("batch", side**2, inputs))
+    shape = ("batch", side**2, channels)
+    graph.output("gradient", int8_sgm(op, q, side, seen), np.float32, shape)
+    clipped = clipped_fraction(op, scaled_inputs(op, q, seen))
+    graph.output("clipped", clipped, np.float32, ())
     rounded = [node.output[0] for node in graph.nodes if node.op_type == "QuantizeLinear"]
     for i, (value, product) in enumerate(zip(rounded[1:], q.products, strict=False)):
-        graph.output(f"hidden{i}", value, np.uint8, ("batch", len(product.bias)))
+        graph.output(f"hidden{i}", value, np.uint8, ("positions", len(product.bias)))
     return graph.model()
 
 
@@ -104,7 +123,7 @@ def run(
     options.graph_optimization_level = level
     session = ort.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
     gradient, clipped, *hidden = session.run(None, {"inputs": inputs})
-    return gradient, clipped, hidden
+    return gradient, clipped, [u8.reshape(*inputs.shape[:2], -1) for u8 in hidden]
 
 
 @settings(max_examples=40, deadline=None)
@@ -113,17 +132,23 @@ def run(
     channels=st.integers(1, 24),
     hidden=st.lists(st.integers(1, 70), min_size=1, max_size=3),
     rows=st.integers(1, 40),
+    kernel_and_side=st.sampled_from([(1, 1), (3, 1), (3, 2), (3, 7)]),
     outlier=st.sampled_from([1.0, 1.5, 1e3, 1e12]),
 )
 def test_onnx_runtime_computes_the_int8_sgm_bit_for_bit(
-    seed: int, channels: int, hidden: list[int], rows: int, outlier: float
+    seed: int,
+    channels: int,
+    hidden: list[int],
+    rows: int,
+    kernel_and_side: tuple[int, int],
+    outlier: float,
 ) -> None:
-    rng = np.random.default_rng(seed)
-    sgm = random_sgm(rng, channels, *hidden)
-    inputs = random_inputs(rng, sgm, rows)
+    rng, (kernel, side) = np.random.default_rng(seed), kernel_and_side
+    sgm = random_sgm(rng, channels, *hidden, kernel=kernel)
+    inputs = random_inputs(rng, sgm, rows, side**2)
     q = quantize_sgm(sgm, seen_ranges(sgm, inputs))
     wild = (inputs * np.where(rng.random(inputs.shape) < 0.1, outlier, 1)).astype(np.float32)
-    model = int8_model(q)
+    model = int8_model(q, side)
     gradient, hidden_u8, clipped = integer_trace(q, wild)
     optimized = run(model, ALL, wild)
     for got, expected in zip(optimized[2], hidden_u8, strict=True):
@@ -146,35 +171,39 @@ def test_without_graph_optimizations_results_differ_by_float_rounding_only(
     # and with it what follows by up to 127 steps of the next product.
     plain, _, got = run(int8_model(q), NONE, inputs)
     assert np.abs(got[0].astype(int) - expected[0]).max() <= 1
-    moved = np.concatenate(got, axis=1) != np.concatenate(expected, axis=1)
+    moved = np.concatenate(got, axis=2) != np.concatenate(expected, axis=2)
     assert moved.mean() < 0.002
-    steady = ~moved.any(axis=1)
+    steady = ~moved.any(axis=2)
     tolerance = 1e-5 * np.abs(gradient).max()
     np.testing.assert_allclose(plain[steady], gradient[steady], rtol=0, atol=tolerance)
 
 
 @DEPTHS
+@KERNELS
 def test_all_products_become_integer_operators_and_no_float_product_is_left(
-    hidden: tuple[int, ...],
+    hidden: tuple[int, ...], kernel: int, side: int
 ) -> None:
     rng = np.random.default_rng(0)
-    sgm = random_sgm(rng, 16, *hidden)
-    model = int8_model(quantize_sgm(sgm, seen_ranges(sgm, random_inputs(rng, sgm, 50))))
+    sgm = random_sgm(rng, 16, *hidden, kernel=kernel)
+    inputs = random_inputs(rng, sgm, 50, side**2)
+    model = int8_model(quantize_sgm(sgm, seen_ranges(sgm, inputs)), side)
     assert integer_operators(model) == ["QGemm"] * 2 * (len(hidden) + 1)
+    refuse_float_products("one SGM", model)
     kinds = [node.op_type for node in optimized_nodes(model)]
-    assert not {"Gemm", "MatMul", "Relu", "DequantizeLinear"} & set(kinds)
+    assert not {"Gemm", "MatMul", "Conv", "Relu", "DequantizeLinear"} & set(kinds)
     assert kinds.count("Add") == len(hidden) + 1
 
 
 @DEPTHS
+@KERNELS
 @pytest.mark.parametrize("seed", range(3))
 def test_int8_stays_close_to_float_whatever_the_channels_scales(
-    seed: int, hidden: tuple[int, ...]
+    seed: int, hidden: tuple[int, ...], kernel: int, side: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    sgm = random_sgm(rng, 16, *hidden)
-    inputs = random_inputs(rng, sgm, 2000)
-    inputs[:, 0] *= 1e4  # one loud channel must not cost the quiet ones anything
+    sgm = random_sgm(rng, 16, *hidden, kernel=kernel)
+    inputs = random_inputs(rng, sgm, 2000 // side**2, side**2)
+    inputs[:, :, 0] *= 1e4  # one loud channel must not cost the quiet ones anything
     sgm.convs[0].weight[:, 0] *= 1e-4
     gradient, clipped = integer_forward(quantize_sgm(sgm, seen_ranges(sgm, inputs)), inputs)
     exact = float_gradient(sgm, inputs)
@@ -212,9 +241,9 @@ def test_inputs_beyond_their_range_are_clipped_and_counted() -> None:
     sgm = random_sgm(rng, 2, 4)
     ranges = SgmRanges(*np.float32([[0] * 5, [1] * 5]), (np.full(4, 9, np.float32),))
     q = quantize_sgm(sgm, ranges)
-    inside = np.full((1, 5), 0.5, np.float32)
+    inside = np.full((1, 1, 5), 0.5, np.float32)
     beyond, edge = inside.copy(), inside.copy()
-    beyond[0, 1], beyond[0, 4], edge[0, 1], edge[0, 4] = 7, -3, 1, 0
+    beyond[..., 1], beyond[..., 4], edge[..., 1], edge[..., 4] = 7, -3, 1, 0
     assert integer_forward(q, beyond)[1] == pytest.approx(2 / 5)
     assert integer_forward(q, edge)[1] == 0
     np.testing.assert_array_equal(integer_forward(q, beyond)[0], integer_forward(q, edge)[0])
@@ -231,7 +260,7 @@ def test_dead_channels_get_the_typical_range_and_are_named() -> None:
     assert q.dead_hidden == ((1, 4),)
     np.testing.assert_allclose(255 / q.input_gain, [4, 2, 2, 1, 2, 2])
     # A channel that was silent in calibration is still heard when it wakes up.
-    quiet, awake = np.array([[1, 0, 1, 1, 0, 1], [1, 1, 1, 1, 0, 1]], np.float32)[:, None]
+    quiet, awake = np.array([[1, 0, 1, 1, 0, 1], [1, 1, 1, 1, 0, 1]], np.float32)[:, None, None]
     assert integer_forward(q, awake)[1] == 0
     assert not np.array_equal(integer_forward(q, awake)[0], integer_forward(q, quiet)[0])
 
@@ -258,7 +287,7 @@ def test_a_bias_that_would_overflow_int32_gets_a_coarser_scale(bias: float) -> N
     sgm.convs[1].bias[1:3] = bias
     q = quantize_sgm(sgm, seen_ranges(sgm, inputs))
     gradient, (hidden,), _ = integer_trace(q, inputs)
-    np.testing.assert_allclose(gradient[:, 1:3], bias, rtol=1e-6)
+    np.testing.assert_allclose(gradient[..., 1:3], bias, rtol=1e-6)
     np.testing.assert_array_equal(run(int8_model(q), ALL, inputs)[0], gradient)
     last, wide = q.products[1], hidden.astype(np.int64)
     for sums in (wide @ last.weight.T.astype(np.int64) + last.bias, wide @ last.fine.T):
@@ -294,12 +323,40 @@ def test_two_planes_hold_a_weight_to_a_five_hundredth_of_a_coarse_step(
         assert np.abs(plane.astype(int)).max() <= 127
 
 
-def test_padded_kernels_are_refused() -> None:
-    convs = [np.zeros(shape, np.float32) for shape in ((8, 11, 3, 3), (8, 8, 3, 3))]
-    sgm = FoldedSgm(2, tuple(FoldedConv(weight, weight[:, 0, 0, 0]) for weight in convs))
-    ones = np.ones(11, np.float32)
-    with pytest.raises(QsgmError, match="behind layer 2 has a 3x3 kernel"):
-        quantize_sgm(sgm, SgmRanges(0 * ones, ones, (ones[:8],)))
+@given(
+    low=st.floats(-1e6, 1e6, width=32),
+    span=st.floats(1e-3, 1e6),
+)
+@example(low=-1.0, span=2.0)
+@example(low=-1e-6, span=1.0)
+def test_zero_has_an_exact_code_in_a_range_that_covers_the_given_one(
+    low: float, span: float
+) -> None:
+    got_low, got_span = with_zero(np.array([low], np.float32), np.array([span]))
+    code = -got_low[0] * 255 / got_span[0]
+    assert code == pytest.approx(round(code), abs=1e-4)
+    step = got_span[0] / 255
+    assert got_low[0] <= low + step  # within a step: where `low` is next to zero, it becomes zero
+    assert got_low[0] + got_span[0] >= (np.float32(low) + span) * (1 - 1e-6)
+    if low == -1:
+        assert (code, 255 / got_span[0]) == (127, 127)
+
+
+def test_what_lies_around_a_map_is_zero_to_the_last_digit() -> None:
+    # Weights that only see the frame: any code but that of zero would show.
+    sgm = random_sgm(np.random.default_rng(8), 2, 4, kernel=3)
+    low, high = np.array([0.5, 0, 0, -1, -1]), np.array([3, 2, 1, 1, 1])
+    sgm.convs[0].weight[:] = 0
+    sgm.convs[0].weight[:, :, 0, 0] = 1
+    sgm.convs[0].bias[:] = 2
+    hidden_high = np.full(4, 2.55, np.float32)  # a step is 0.01
+    ranges = SgmRanges(low.astype(np.float32), high.astype(np.float32), (hidden_high,))
+    q = quantize_sgm(sgm, ranges)
+    assert q.input_low[0] == 0
+    np.testing.assert_array_equal(q.input_gain[3:], 127)
+    inputs = np.random.default_rng(9).uniform(low, high, (3, 1, 5)).astype(np.float32)
+    _, hidden, _ = integer_trace(q, inputs)
+    np.testing.assert_array_equal(hidden[0], 200)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import onnx
 import pytest
 
 from qsgm import QsgmError
+from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, step_file, trunk_file
 from qsgm.runtime import open_session, running
 from qsgm.train.graphs.inspection import integer_operators
@@ -16,7 +17,7 @@ def test_products_of_u8_and_s8_are_exact_on_cpus_without_vnni(bundle: Bundle) ->
 
 
 def test_int8_sgms_run_as_integer_products_with_these_settings(bundle: Bundle) -> None:
-    model = onnx.load(bundle.folder / step_file("sgm", "int8", "sgd", 3))
+    model = onnx.load(bundle.folder / step_file("int8", "sgd", single_layers(3)))
     assert set(integer_operators(model)) == {"QGemm"}
 
 

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qsgm import QsgmError
+from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
+from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.fold import (
     FoldedNet,
     FoldedSgm,
@@ -22,19 +24,21 @@ from qsgm.train.fold import (
     run_folded_conv,
     run_folded_sgm,
 )
-from qsgm.train.graphs.inspection import integer_operators
+from qsgm.train.graphs.inspection import integer_operators, refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
-from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
-from qsgm.train.graspnet import Loss
+from qsgm.train.graphs.step import AnySgm, step_model
+from qsgm.train.graspnet import Loss, normalize
 from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.sgm import Sgm
 from qsgm.tuning import StepLoop
 from qsgm.weights import to_step_layout
 
 CROPS, BATCH = 37, 8
-RATES = {4: 0.002, 5: 0.005, 6: 0.02}
-DEPTHS = pytest.mark.parametrize("hidden", [None, (64, 64)], ids=["paper", "deep"])
+RATES = {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.002, 5: 0.005, 6: 0.02}
+# Input of the first tuned layer, by how many are tuned; of all six it is the pixels.
+POSITIONS = {1: 1, 2: 1, 3: 169, 4: 841, 5: 3844, 6: 16384}
+CHANNELS = {1: 16, 2: 16, 3: 16, 4: 8, 5: 8, 6: 3}
 LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=3.0)]
 TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
     Sgd: lambda groups: torch.optim.SGD(groups, momentum=0.9),
@@ -51,20 +55,28 @@ def net() -> FoldedNet:
 
 def random_sgms(hidden: Sequence[int] | None = None) -> dict[int, FoldedSgm]:
     torch.manual_seed(4)
-    return {layer: fold_sgm(Sgm(layer, hidden).eval()) for layer in (4, 5)}
+    return {layer: fold_sgm(Sgm(layer, hidden).eval()) for layer in range(1, 6)}
 
 
-def random_data(tuned: int) -> Arrays:
+def quiet(sgms: dict[int, FoldedSgm]) -> dict[int, FoldedSgm]:
+    """Untrained as they are, kept from running away."""
+    for sgm in sgms.values():
+        sgm.convs[-1].weight[:] *= 0.03
+        sgm.convs[-1].bias[:] *= 0.03
+    return sgms
+
+
+def random_data(tuned: int, crops: int = CROPS) -> Arrays:
     """Features of every crop as the frozen layers leave them, and labels."""
     rng = np.random.default_rng(tuned)
-    positions = 169 if tuned == 3 else 1
-    angle = rng.uniform(-np.pi, np.pi, CROPS)
-    quality = (rng.random(CROPS) < 0.6).astype(float)
-    data = {
-        "features": np.maximum(rng.normal(size=(CROPS, positions, 16)), 0),
-        "labels": np.stack([quality, np.sin(angle), np.cos(angle)], axis=1),
-    }
-    return {name: value.astype(np.float32) for name, value in data.items()}
+    angle = rng.uniform(-np.pi, np.pi, crops)
+    quality = (rng.random(crops) < 0.6).astype(float)
+    shape = (crops, POSITIONS[tuned], CHANNELS[tuned])
+    features = np.maximum(rng.normal(size=shape), 0).astype(np.float32)
+    if tuned == 6:
+        features = rng.integers(0, 256, shape, np.uint8)
+    labels = np.stack([quality, np.sin(angle), np.cos(angle)], axis=1).astype(np.float32)
+    return {"features": features, "labels": labels}
 
 
 def session(model: onnx.ModelProto, **options: object) -> ort.InferenceSession:
@@ -107,10 +119,10 @@ class Exported:
 class Reference:
     """The last layers as torch convolutions, trained by autograd."""
 
-    def __init__(self, net: FoldedNet, tuned: int, loss: Loss, optimizer: Optimizer) -> None:
+    def __init__(self, net: FoldedNet, layers: range, loss: Loss, optimizer: Optimizer) -> None:
         self.loss = loss
         self.convs = {}
-        for number in range(7 - tuned, 7):
+        for number in layers:
             folded = net.layers[number - 1]
             out_channels, in_channels, kernel, _ = folded.weight.shape
             conv = nn.Conv2d(in_channels, out_channels, kernel, folded.stride)
@@ -125,22 +137,19 @@ class Reference:
         x = F.relu(x) if number < 6 else x
         return F.avg_pool2d(x, 5) if number == 4 else x
 
-    def backprop_step(self, x: Tensor, labels: Tensor) -> float:
-        for number in self.convs:
-            x = self.layer(number, x)
-        return self.finish(self.loss(x.flatten(1), labels))
-
-    def local_step(self, x: Tensor, labels: Tensor, sgms: Mapping[int, AnySgm]) -> float:
-        """Every layer sees a detached input, and the SGM's gradient as if from behind."""
+    def step(self, x: Tensor, labels: Tensor, blocks: Blocks, sgms: Mapping[int, AnySgm]) -> float:
+        """Every block sees a detached input, and the SGM's gradient as if from behind."""
         stand_in = torch.zeros(())
-        for number in self.convs:
-            x = self.layer(number, x.detach())
-            if number < 6:
-                gradient = sgm_gradient(sgms[number], x.detach(), labels)
+        for group in blocks.groups:
+            x = x.detach()
+            for number in group:
+                x = self.layer(number, x)
+            if group[-1] < 6:
+                gradient = sgm_gradient(sgms[group[-1]], x.detach(), labels)
                 stand_in = stand_in + (x * gradient).sum() / len(x)
         return self.finish(self.loss(x.flatten(1), labels), stand_in)
 
-    def finish(self, loss: Tensor, stand_in: Tensor | float = 0.0) -> float:
+    def finish(self, loss: Tensor, stand_in: Tensor) -> float:
         """Update; return the loss before it."""
         self.optimizer.zero_grad()
         (loss + stand_in).backward()
@@ -151,15 +160,27 @@ class Reference:
 def sgm_gradient(sgm: AnySgm, activation: Tensor, labels: Tensor) -> Tensor:
     if isinstance(sgm, FoldedSgm):
         return run_folded_sgm(sgm, activation, labels)
-    seen = torch.cat([activation.flatten(1), labels], dim=1)
-    return torch.tensor(integer_forward(sgm, seen.numpy())[0])[:, :, None, None]
+    gradient = integer_forward(sgm, seen_by_sgm(activation, labels).numpy())[0]
+    return as_map(gradient)
+
+
+def seen_by_sgm(activation: Tensor, labels: Tensor) -> Tensor:
+    """(B, P, Ci), position by position."""
+    filled = labels[:, :, None, None].expand(-1, -1, *activation.shape[2:])
+    return torch.cat([activation, filled], dim=1).flatten(2).transpose(1, 2)
+
+
+def rows_of(maps: Tensor) -> Tensor:
+    """(B, C, H, W) to position-major (B, P, C)."""
+    return maps.flatten(2).transpose(1, 2)
 
 
 def as_map(features: np.ndarray) -> Tensor:
-    """Position-major (N, P, C) to (N, C, H, W)."""
+    """Position-major (N, P, C) to (N, C, H, W); pixels to [-1, 1]."""
     count, positions, channels = features.shape
     side = round(positions**0.5)
-    return torch.tensor(features).reshape(count, side, side, channels).permute(0, 3, 1, 2)
+    maps = torch.tensor(features).reshape(count, side, side, channels)
+    return normalize(maps) if features.dtype == np.uint8 else maps.permute(0, 3, 1, 2)
 
 
 def picked(data: Arrays, rows: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -172,7 +193,9 @@ def assert_same_weights(exported: Exported, reference: Reference, tolerance: flo
         weight = conv.weight.detach().permute(0, 2, 3, 1).flatten(1)
         for name, expected in (("weight", weight), ("bias", conv.bias.detach())):
             got = torch.tensor(exported.feeds[f"{name}{number}"])
-            torch.testing.assert_close(got, expected, rtol=tolerance, atol=tolerance)
+            # Sums over thousands of positions cancel: an error counts against the largest entry.
+            scale = max(1.0, float(expected.abs().max()))
+            torch.testing.assert_close(got, expected, rtol=tolerance, atol=tolerance * scale)
 
 
 def batches(steps: int) -> list[np.ndarray]:
@@ -184,79 +207,72 @@ def batches(steps: int) -> list[np.ndarray]:
     return rows[:steps]
 
 
-@DEPTHS
-@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
-@pytest.mark.parametrize("tuned", [1, 2, 3])
-def test_a_local_update_equals_autograd_with_the_sgms_gradient_injected(
-    net: FoldedNet, tuned: int, loss: Loss, hidden: Sequence[int] | None
-) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(BATCH)
-    exported = Exported(step_model(net, tuned, sgms, loss, Sgd()), net, data)
-    reference = Reference(net, tuned, loss, Sgd())
-    for number in reference.convs:  # compare whole gradients, not a thousandth of them
+SINGLE_STEPS = ["6", "5,6", "4,5,6", "4,5-6", "4-5,6", "4-6", "3,4-5,6", "3-6", "2,3,4,5,6"]
+SINGLE_STEPS += ["1,2,3,4,5,6", "1-4,5,6", "1-2,3,4-6", "1-6"]
+
+
+def at_rate_one(exported: Exported, reference: Reference) -> None:
+    """Compare whole gradients, not a thousandth of them."""
+    for number in reference.convs:
         exported.feeds[f"rate{number}"] = np.array(1, np.float32)
     for group in reference.optimizer.param_groups:
         group["lr"] = 1.0
-    expected_loss = reference.local_step(*picked(data, rows), sgms)
-    results = exported.step(rows)
-    assert_same_weights(exported, reference, 1e-5)
-    assert results["loss"] == pytest.approx(expected_loss, abs=1e-6)
-
-
-@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
-@pytest.mark.parametrize("tuned", [1, 2, 3])
-def test_a_hundred_local_steps_equal_torchs(
-    net: FoldedNet, tuned: int, optimizer: Optimizer
-) -> None:
-    data, sgms = random_data(tuned), random_sgms()
-    for sgm in sgms.values():  # untrained as they are, keep them from running away
-        sgm.convs[-1].weight[:] *= 0.1
-        sgm.convs[-1].bias[:] *= 0.1
-    exported = Exported(step_model(net, tuned, sgms, Loss(), optimizer), net, data)
-    reference = Reference(net, tuned, Loss(), optimizer)
-    start = reference.convs[7 - tuned].weight.detach().clone()
-    for rows in batches(100):
-        expected_loss = reference.local_step(*picked(data, rows), sgms)
-        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, rel=1e-3)
-    assert_same_weights(exported, reference, 1e-4)
-    assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
-    assert exported.feeds.get("step", 100) == 100
-
-
-@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
-@pytest.mark.parametrize("tuned", [1, 2, 3])
-def test_a_hundred_backprop_steps_equal_torchs(
-    net: FoldedNet, tuned: int, optimizer: Optimizer
-) -> None:
-    data = random_data(tuned)
-    exported = Exported(backprop_step_model(net, tuned, Loss(), optimizer), net, data)
-    reference = Reference(net, tuned, Loss(), optimizer)
-    start = reference.convs[7 - tuned].weight.detach().clone()
-    for count, rows in enumerate(batches(100), start=1):
-        expected_loss = reference.backprop_step(*picked(data, rows))
-        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, rel=1e-3)
-        if count == 1:
-            assert_same_weights(exported, reference, 1e-5)
-    assert_same_weights(exported, reference, 1e-4)
-    assert (reference.convs[7 - tuned].weight - start).abs().max() > 1e-2
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
-def test_a_backprop_step_equals_autograd_for_both_angle_encodings(
-    net: FoldedNet, loss: Loss
+@pytest.mark.parametrize("text", SINGLE_STEPS)
+def test_an_update_equals_autograd_with_the_sgms_gradient_injected_behind_every_block(
+    net: FoldedNet, text: str, loss: Loss
 ) -> None:
-    data, rows = random_data(3), np.arange(BATCH)
-    exported = Exported(backprop_step_model(net, 3, loss, Sgd()), net, data)
-    reference = Reference(net, 3, loss, Sgd())
-    expected_loss = reference.backprop_step(*picked(data, rows))
-    assert exported.step(rows)["loss"] == pytest.approx(expected_loss, abs=1e-6)
-    assert_same_weights(exported, reference, 1e-6)
+    blocks = parse_blocks(text)
+    data, rows = random_data(len(blocks.layers)), np.arange(BATCH)
+    for hidden in (None, (12, 10)):
+        sgms = random_sgms(hidden)
+        exported = Exported(step_model(net, blocks, sgms, loss, Sgd()), net, data)
+        reference = Reference(net, blocks.layers, loss, Sgd())
+        at_rate_one(exported, reference)
+        expected_loss = reference.step(*picked(data, rows), blocks, sgms)
+        results = exported.step(rows)
+        assert_same_weights(exported, reference, 1e-5)
+        assert results["loss"] == pytest.approx(expected_loss, abs=1e-6)
+
+
+OPTIMIZERS = pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
+
+
+@OPTIMIZERS
+@pytest.mark.parametrize("text", ["6", "5,6", "4,5,6", "4,5-6", "5-6", "4-6"])
+def test_a_hundred_steps_equal_torchs(net: FoldedNet, text: str, optimizer: Optimizer) -> None:
+    compare_runs(net, parse_blocks(text), optimizer, steps=100)
+
+
+@OPTIMIZERS
+@pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1-6", "2-4,5,6", "3,4,5-6"])
+def test_a_few_steps_of_many_layers_equal_torchs(
+    net: FoldedNet, text: str, optimizer: Optimizer
+) -> None:
+    compare_runs(net, parse_blocks(text), optimizer, steps=6)
+
+
+def compare_runs(net: FoldedNet, blocks: Blocks, optimizer: Optimizer, steps: int) -> None:
+    data, sgms = random_data(len(blocks.layers)), quiet(random_sgms())
+    exported = Exported(step_model(net, blocks, sgms, Loss(), optimizer), net, data)
+    reference = Reference(net, blocks.layers, Loss(), optimizer)
+    start = {number: conv.weight.detach().clone() for number, conv in reference.convs.items()}
+    for rows in batches(steps):
+        expected_loss = reference.step(*picked(data, rows), blocks, sgms)
+        assert exported.step(rows)["loss"] == pytest.approx(expected_loss, rel=1e-3)
+    assert_same_weights(exported, reference, 1e-4)
+    moved = [float((c.weight.detach() - start[k]).abs().max()) for k, c in reference.convs.items()]
+    assert max(moved) > 5e-3
+    assert min(moved) > 1e-6
+    assert exported.feeds.get("step", steps) == steps
 
 
 def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
     data = random_data(1)
     data["features"] *= 1e5
-    exported = Exported(backprop_step_model(net, 1, Loss(), Sgd()), net, data)
+    exported = Exported(step_model(net, one_block(1), {}, Loss(), Sgd()), net, data)
     results = exported.step(np.arange(CROPS))
     assert all(np.isfinite(value).all() for value in results.values())
     assert results["loss"] > 1000
@@ -265,17 +281,18 @@ def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
 def seen_by_sgms(
     net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
 ) -> dict[int, SgmRanges]:
-    reference = Reference(net, tuned, Loss(), Sgd())
-    x, labels = picked(data, np.arange(CROPS))
+    reference = Reference(net, tuned_layers(tuned), Loss(), Sgd())
+    x, labels = picked(data, np.arange(len(data["labels"])))
     ranges = {}
-    for number in range(7 - tuned, 6):
+    for number in tuned_layers(tuned)[:-1]:
         x = reference.layer(number, x).detach()
-        seen = torch.cat([x.flatten(1), labels], dim=1)
-        hidden = [seen[:, :, None, None]]
+        seen = seen_by_sgm(x, labels)
+        hidden = [as_map(seen.numpy())]
         for conv in sgms[number].convs[:-1]:
             hidden.append(F.relu(run_folded_conv(conv, hidden[-1])))
         highs = tuple(tensor.amax(dim=(0, 2, 3)).numpy() for tensor in hidden[1:])
-        ranges[number] = SgmRanges(seen.amin(dim=0).numpy(), seen.amax(dim=0).numpy(), highs)
+        low, high = seen.amin(dim=(0, 1)).numpy(), seen.amax(dim=(0, 1)).numpy()
+        ranges[number] = SgmRanges(low, high, highs)
     return ranges
 
 
@@ -286,39 +303,51 @@ def quantized(
     return {number: quantize_sgm(sgms[number], ranges[number]) for number in ranges}
 
 
-@DEPTHS
-@pytest.mark.parametrize("tuned", [2, 3])
+@pytest.mark.parametrize(
+    ("text", "hidden"),
+    [
+        *((text, hidden) for text in ("5,6", "4,5,6", "4,5-6") for hidden in (None, (64, 64))),
+        ("3,4-5,6", None),
+        ("1,2,3,4,5,6", None),
+        ("1-3,4,5,6", (12, 10)),
+    ],
+)
 def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
-    net: FoldedNet, tuned: int, hidden: Sequence[int] | None
+    net: FoldedNet, text: str, hidden: Sequence[int] | None
 ) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(BATCH)
-    int8_sgms = quantized(net, tuned, data, sgms)
-    model = step_model(net, tuned, int8_sgms, Loss(), Sgd())
-    assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
+    blocks = parse_blocks(text)
+    data, sgms, rows = random_data(len(blocks.layers), 12), random_sgms(hidden), np.arange(BATCH)
+    int8_sgms = quantized(net, len(blocks.layers), data, sgms)
+    model = step_model(net, blocks, int8_sgms, Loss(), Sgd())
+    products = 2 * len(sgms[4].convs) * len(blocks.sgm_layers)
+    assert integer_operators(model) == ["QGemm"] * products
+    refuse_float_products(text, model)
     exported = Exported(model, net, data)
-    reference = Reference(net, tuned, Loss(), Sgd())
-    reference.local_step(*picked(data, rows), int8_sgms)
+    reference = Reference(net, blocks.layers, Loss(), Sgd())
+    reference.step(*picked(data, rows), blocks, int8_sgms)
     exported.step(rows)
     assert_same_weights(exported, reference, 1e-5)
 
 
-@DEPTHS
-@pytest.mark.parametrize("tuned", [2, 3])
+@pytest.mark.parametrize(
+    ("tuned", "hidden"),
+    [(2, None), (2, (64, 64)), (3, None), (3, (64, 64)), (4, (12, 10)), (6, None)],
+)
 def test_the_probe_gives_true_float_and_int8_gradients(
     net: FoldedNet, tuned: int, hidden: Sequence[int] | None
 ) -> None:
-    data, sgms, rows = random_data(tuned), random_sgms(hidden), np.arange(20)
+    data, sgms, rows = random_data(tuned, 12), random_sgms(hidden), np.arange(BATCH)
     int8_sgms = quantized(net, tuned, data, sgms)
     model = probe_model(net, tuned, sgms, int8_sgms, Loss())
     assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
     got = Exported(model, net, data).step(rows)
 
-    reference = Reference(net, tuned, Loss(), Sgd())
+    reference = Reference(net, tuned_layers(tuned), Loss(), Sgd())
     x, labels = picked(data, rows)
     activations = {}
     for number in reference.convs:
         x = activations[number] = reference.layer(number, x)
-    behind = {number: activations[number] for number in range(7 - tuned, 6)}
+    behind = {number: activations[number] for number in tuned_layers(tuned)[:-1]}
     total = Loss().per_sample(x.flatten(1), labels).sum()
     truths = torch.autograd.grad(total, list(behind.values()))
     for (number, activation), truth in zip(behind.items(), truths, strict=True):
@@ -326,37 +355,61 @@ def test_the_probe_gives_true_float_and_int8_gradients(
         for name, expected in (
             ("true", truth),
             ("float", sgm_gradient(sgms[number], seen, labels)),
-            ("int8", sgm_gradient(int8_sgms[number], seen, labels)),
         ):
-            np.testing.assert_allclose(got[f"{name}{number}"], expected.flatten(1), atol=1e-5)
+            np.testing.assert_allclose(got[f"{name}{number}"], rows_of(expected), atol=1e-5)
+        integers = rows_of(sgm_gradient(int8_sgms[number], seen, labels)).numpy()
+        # Activations differ in their last bits between the two; a few then round the other way.
+        close = np.isclose(got[f"int8{number}"], integers, atol=1e-5)
+        assert close.mean() > 0.99
         assert got[f"clipped{number}"] == 0
 
 
 def test_the_probe_counts_inputs_beyond_their_ranges(net: FoldedNet) -> None:
-    data, sgms = random_data(2), random_sgms()
-    int8_sgms = quantized(net, 2, data, sgms)
-    data["labels"] = np.full((CROPS, 3), 9, np.float32)
-    got = Exported(probe_model(net, 2, sgms, int8_sgms, Loss()), net, data).step(np.arange(9))
-    assert got["clipped5"] == pytest.approx(3 / 19)
+    data, sgms = random_data(4, 12), random_sgms()
+    int8_sgms = quantized(net, 4, data, sgms)
+    data["labels"] = np.full((12, 3), 9, np.float32)
+    got = Exported(probe_model(net, 4, sgms, int8_sgms, Loss()), net, data).step(np.arange(9))
+    for number in (3, 4, 5):
+        assert got[f"clipped{number}"] == pytest.approx(3 / 19)
 
 
-def test_layers_run_one_after_the_other_so_that_their_memory_is_freed(
-    net: FoldedNet, tmp_path: Path
+@pytest.mark.parametrize("text", ["4,5,6", "4-5,6", "3-4,5-6", "2,3-4,5,6"])
+def test_blocks_run_one_after_the_other_so_that_their_memory_is_freed(
+    net: FoldedNet, tmp_path: Path, text: str
 ) -> None:
-    data, sgms = random_data(3), random_sgms()
-    model = step_model(net, 3, quantized(net, 3, data, sgms), Loss(), Sgd())
-    exported = Exported(model, net, data)
-    profiled = session(model, enable_profiling=True, profile_file_prefix=str(tmp_path / "run"))
+    blocks = parse_blocks(text)
+    data, sgms = random_data(len(blocks.layers), BATCH), random_sgms()
+    int8_sgms = quantized(net, len(blocks.layers), data, sgms)
+    exported = Exported(step_model(net, blocks, int8_sgms, Loss(), Sgd()), net, data)
+    profiled = session(
+        step_model(net, blocks, int8_sgms, Loss(), Sgd()),
+        enable_profiling=True,
+        profile_file_prefix=str(tmp_path / "run"),
+    )
     profiled.run(None, {**exported.feeds, "rows": np.arange(BATCH)})
     events = json.loads(Path(profiled.end_profiling()).read_text())
-    order = [event["name"][:6] for event in events if event.get("cat") == "Node"]
-    layers = [name for name in order if name.startswith("layer")]
-    assert set(layers) == {"layer4", "layer5", "layer6"}
-    assert layers == sorted(layers)
+    order = [event["name"] for event in events if event.get("cat") == "Node"]
+    numbers = [int(name[5]) for name in order if name.startswith("layer")]
+    assert set(numbers) == set(blocks.layers)
+    ran = [next(i for i, group in enumerate(blocks.groups) if n in group) for n in numbers]
+    assert ran == sorted(ran)
+
+
+@pytest.mark.parametrize(
+    ("text", "carried_back_through"),
+    [("1,2,3,4,5,6", 0), ("1-4,5,6", 3), ("3,4-5,6", 0), ("3-4,5-6", 1), ("1-6", 3)],
+)
+def test_gradients_are_carried_back_inside_blocks_only(
+    net: FoldedNet, text: str, carried_back_through: int
+) -> None:
+    """5x5 layers through which a gradient is carried back: those of a block but its first."""
+    model = step_model(net, parse_blocks(text), random_sgms(), Loss(), Sgd())
+    kinds = [node.op_type for node in model.graph.node]
+    assert kinds.count("ConvTranspose") == carried_back_through
 
 
 def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
-    model = step_model(net, 2, random_sgms(), Loss(), Sgd())
+    model = step_model(net, single_layers(2), random_sgms(), Loss(), Sgd())
     state = [f"{kind}{layer}" for layer in (5, 6) for kind in ("weight", "bias")]
     state += [name[:-1] + "_momentum" + name[-1] for name in state]
     others = {"features", "labels", "rows", "rate5", "rate6"}
@@ -366,31 +419,28 @@ def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
     assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
 
 
-@pytest.mark.parametrize("tuned", [0, 4])
-def test_another_number_of_layers_is_refused(net: FoldedNet, tuned: int) -> None:
-    with pytest.raises(QsgmError, match=f"last {tuned} layers: choose 1, 2 or 3"):
-        backprop_step_model(net, tuned, Loss(), Sgd())
-
-
 def test_there_is_nothing_to_probe_behind_the_last_layer(net: FoldedNet) -> None:
     with pytest.raises(QsgmError, match="SGMs of 1 tuned layers: the last layer has none"):
         probe_model(net, 1, {}, {}, Loss())
 
 
-@pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
+@OPTIMIZERS
+@pytest.mark.parametrize("text", ["4,5,6", "1-4,5,6"])
 def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
-    net: FoldedNet, optimizer: Optimizer
+    net: FoldedNet, text: str, optimizer: Optimizer
 ) -> None:
-    data = random_data(3)
-    model = step_model(net, 3, random_sgms((64, 64)), Loss(), optimizer)
+    blocks = parse_blocks(text)
+    data = random_data(len(blocks.layers))
+    model = step_model(net, blocks, quiet(random_sgms((64, 64))), Loss(), optimizer)
     exported = Exported(model, net, data)
     start = {
         name: value.copy()
         for name, value in exported.feeds.items()
         if name in {f"{kind}{k}" for kind in ("weight", "bias") for k in RATES}
     }
-    loop = StepLoop(session(model), data["features"], data["labels"], start, RATES)
-    for rows in batches(12):
+    rates = {number: RATES[number] for number in blocks.layers}
+    loop = StepLoop(session(model), data["features"], data["labels"], start, rates)
+    for rows in batches(12 if len(rates) == 3 else 3):
         assert loop.step(rows) == float(exported.step(rows)["loss"])
     tuned = loop.weights()
     assert set(tuned) == set(start)
@@ -402,5 +452,30 @@ def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
 def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:
     sgms = random_sgms()
     del sgms[4]
-    with pytest.raises(QsgmError, match=r"no SGM for layers \[4\]"):
-        step_model(net, 3, sgms, Loss(), Sgd())
+    with pytest.raises(QsgmError, match=r"no SGM for layers \[4\]: tuning 4,5,6 needs"):
+        step_model(net, single_layers(3), sgms, Loss(), Sgd())
+    step_model(net, parse_blocks("4-5,6"), sgms, Loss(), Sgd())
+
+
+@pytest.mark.parametrize("text", ["4,5,6", "5,6", "3-4,5,6"])
+def test_gradients_are_bent_in_the_graph_as_they_are_in_torch(net: FoldedNet, text: str) -> None:
+    blocks, rows = parse_blocks(text), np.arange(BATCH)
+    data, sgms = random_data(len(blocks.layers)), random_sgms()
+    torch.manual_seed(0)
+    curvatures = {
+        k: Curvature(*(torch.randn(m.shape) for m in Curvature.identity(k).matrices))
+        for k in blocks.layers
+    }
+    momenta = []
+    for used in (FLAT, curvatures):
+        exported = Exported(step_model(net, blocks, sgms, Loss(), Sgd(), used), net, data)
+        momenta.append(exported.step(rows))
+    for k, curvature in curvatures.items():
+        plain, bent = (
+            [torch.from_numpy(m[f"{kind}_momentum{k}_next"]) for kind in ("weight", "bias")]
+            for m in momenta
+        )
+        weight, bias = curvature.bend(plain[0].T[None], plain[1][None])
+        scale = float(weight.abs().max())
+        torch.testing.assert_close(bent[0] / scale, weight[0].T / scale, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(bent[1], bias[0], atol=1e-4, rtol=1e-4)

@@ -20,11 +20,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.fidelity import LayerFidelity, compare, mean_over_run
 from qsgm.images import read_demonstration
 from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.fold import FloatArray, FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.train.fold import (
+    FloatArray,
+    FoldedConv,
+    FoldedNet,
+    FoldedSgm,
+    fold_net,
+    fold_sgm,
+    run_folded_conv,
+)
 from qsgm.train.graspnet import LAYERS
 from qsgm.train.local import LayerState, local_step, loss_gradient, true_gradients
 from qsgm.train.maml import MOMENTUM
@@ -37,17 +46,23 @@ MANIFEST = "manifest.json"
 FORMAT, VERSION = "qsgm-calibration", 1
 CROPS = 400
 EPOCHS = 40  # as many steps as 20 epochs on the 800 crops of the device
-MOST_LAYERS = 3
-SGM_BEHIND_TUNED = tuple(range(LAYERS + 1 - MOST_LAYERS, LAYERS))
+# The most layers whose SGMs all see one position per crop. Those further ahead see whole maps, so
+# that a step takes about a hundred times as long: whole runs of them would take hours.
+ONE_POSITION = 3
+# A run of all layers is therefore a short one, its rates decaying as fast, on the same frames. The
+# activations of those layers move little, and every crop gives as many samples as its map is large.
+MAP_CROPS = 96
+MAP_EPOCHS = 10
 # The label is known before anything is seen: quality, sine, cosine.
 LABEL_LOW = np.array([0, -1, -1], np.float32)
 LABEL_HIGH = np.array([1, 1, 1], np.float32)
 # Steps between two measurements of fidelity; consecutive steps tell the same.
 MEASURE_EVERY_STEPS = 13
+MEASURE_MAPS_EVERY_STEPS = 15
 
 # (what is going on, frames done, of how many)
 Watch = Callable[[str, int, int], None]
-# (layer, what its SGM sees (B, Ci)) -> gradient (B, C)
+# (layer, what its SGM sees (B, P, Ci)) -> gradient (B, P, C)
 SgmGradient = Callable[[int, FloatArray], FloatArray]
 
 
@@ -147,7 +162,7 @@ class Observer(Protocol):
     """Watches the channels of one tensor and says what span of values int8 has to cover."""
 
     def update(self, values: FloatArray) -> None:
-        """Look at values (N, C) before they are dropped."""
+        """Look at values (..., C) before they are dropped."""
         ...
 
     def merge(self, other: Self) -> None:
@@ -169,7 +184,8 @@ class MinMax:
         self._high = np.full(channels, -np.inf, np.float32)
 
     def update(self, values: FloatArray) -> None:
-        self._include(values.min(axis=0), values.max(axis=0))
+        flat = values.reshape(-1, values.shape[-1])
+        self._include(flat.min(axis=0), flat.max(axis=0))
 
     def merge(self, other: Self) -> None:
         self._include(*other.span())
@@ -190,8 +206,8 @@ class SgmObservers:
         self._hidden = [make(len(conv.bias)) for conv in sgm.convs[:-1]]
 
     def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
-        """One batch: inputs (B, Ci) and hidden tensors (B, H), after ReLU."""
-        self._activation.update(seen[:, : -len(LABEL_LOW)])
+        """One batch: inputs (B, P, Ci) and hidden tensors (B, P, H), after ReLU."""
+        self._activation.update(seen[..., : -len(LABEL_LOW)])
         for observer, values in zip(self._hidden, hidden, strict=True):
             observer.update(values)
 
@@ -230,17 +246,36 @@ class Trainee:
             tasks=1,
         )
 
-    def task(self, demonstration: Demonstration, tuned: int, seed: list[int]) -> Task:
+    def task(self, demonstration: Demonstration, plan: "RunPlan", seed: list[int]) -> Task:
         """The crops of one frame, as the first of the tuned layers sees them."""
         return make_task(
             self.checkpoint.net,
             demonstration.image,
             np.random.default_rng(seed),
-            last_frozen=LAYERS - tuned,
-            count=CROPS,
+            last_frozen=LAYERS - plan.tuned,
+            count=plan.crops,
             loss=self.checkpoint.loss,
             center_px=demonstration.center_px,
         )
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A fine-tuning run: how many layers, on how many crops, for how many passes over them."""
+
+    tuned: int
+    crops: int
+    epochs: int
+
+    @property
+    def maps(self) -> bool:
+        """Whether there are SGMs in it that see whole maps; it is then there for those alone."""
+        return self.tuned > ONE_POSITION
+
+    @property
+    def measured(self) -> range:
+        """The layers of the SGMs that it is there for."""
+        return range(LAYERS + 1 - self.tuned, LAYERS + 1 - ONE_POSITION if self.maps else LAYERS)
 
 
 @dataclass(frozen=True)
@@ -253,20 +288,18 @@ class Moment:
 
 
 def prepare(checkpoint: Checkpoint) -> Trainee:
-    """Fold a checkpoint.
-
-    Raises:
-        QsgmError: batchnorm cannot be folded, or SGMs or rates for up to three layers are missing.
-    """
-    expected = {tuned: tuned for tuned in range(1, MOST_LAYERS + 1)}
-    got = {tuned: len(rates) for tuned, rates in checkpoint.rates.items()}
-    if set(checkpoint.sgms) != set(SGM_BEHIND_TUNED) or got != expected:
-        raise QsgmError(
-            f"the checkpoint has SGMs behind layers {sorted(checkpoint.sgms)} and rates (count by"
-            f" tuned layers) {got}, expected {[*SGM_BEHIND_TUNED]} and {expected}; pretrain again"
-        )
+    """Fold a checkpoint. Raises QsgmError where batchnorm cannot be folded."""
     sgms = {layer: fold_sgm(sgm) for layer, sgm in sorted(checkpoint.sgms.items())}
     return Trainee(checkpoint, fold_net(checkpoint.net), sgms)
+
+
+def run_plans(most_layers: int, epochs: int) -> list[RunPlan]:
+    """Whole runs of two and of three layers, and a short one of all layers if there are more."""
+    whole = range(2, min(most_layers, ONE_POSITION) + 1)
+    plans = [RunPlan(tuned, CROPS, epochs) for tuned in whole]
+    if most_layers > ONE_POSITION:
+        plans.append(RunPlan(most_layers, MAP_CROPS, min(epochs, MAP_EPOCHS)))
+    return plans
 
 
 def calibrate(
@@ -274,14 +307,15 @@ def calibrate(
 ) -> dict[int, SgmRanges]:
     """Fine-tune on every frame with the float SGMs and take each SGM's ranges on the way.
 
-    Layers are tuned by twos and by threes: the SGM behind layer 5 serves both.
+    Layers are tuned by twos and by threes: the SGM behind layer 5 serves both. Where SGMs stand
+    behind layers 1 to 3 all layers are tuned as well, see :data:`MAP_EPOCHS`.
 
     Args:
         trainee: what to fine-tune.
         frames: the calibration set.
         seed: of crops and batches.
         watch: told about progress.
-        epochs: length of a run.
+        epochs: length of a whole run.
 
     Returns:
         Ranges by layer.
@@ -303,14 +337,15 @@ def observe_frame(
 ) -> dict[int, SgmObservers]:
     """What each SGM sees in the runs on one frame."""
     observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
+    for plan in run_plans(trainee.checkpoint.most_layers, epochs):
 
-    def gradient(layer: int, seen: FloatArray) -> FloatArray:
-        result, hidden = float_trace(trainee.sgms[layer], seen)
-        observers[layer].update(seen, hidden)
-        return result
+        def gradient(layer: int, seen: FloatArray, plan: RunPlan = plan) -> FloatArray:
+            result, hidden = float_trace(trainee.sgms[layer], seen)
+            if layer in plan.measured:
+                observers[layer].update(seen, hidden)
+            return result
 
-    for tuned in range(2, MOST_LAYERS + 1):
-        for _ in run(trainee, demonstration, tuned, seed, epochs, gradient):
+        for _ in run(trainee, demonstration, plan, seed, gradient):
             pass
     return observers
 
@@ -323,40 +358,57 @@ def measure(
     watch: Watch,
     epochs: int = EPOCHS,
 ) -> dict[int, LayerFidelity]:
-    """Fidelity of each int8 SGM, mean over runs of the last three layers on every frame.
+    """Fidelity of each int8 SGM, mean over runs on every frame.
 
-    The int8 SGMs drive the runs, as on the device: what they see is what they have led to.
+    Behind layers 4 and 5 it is taken along whole runs of the last three layers, and the int8 SGMs
+    drive them, as on the device: what they see is what they have led to. Behind layers 1 to 3 it is
+    taken along the short runs of all layers, which the float SGMs drive: they are quicker here.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
+    most = trainee.checkpoint.most_layers
+    # Two layers are part of three.
+    plans = [plan for plan in run_plans(most, epochs) if plan.tuned >= min(most, ONE_POSITION)]
     for i in range(len(frames)):
         watch("measure", i, len(frames))
-        moments = run(
-            trainee,
-            frames[i],
-            MOST_LAYERS,
-            [seed, i],
-            epochs,
-            lambda layer, seen: integer_forward(int8_sgms[layer], seen)[0],
-        )
-        for moment in islice(moments, 0, None, MEASURE_EVERY_STEPS):
-            for layer, fidelity in compare_moment(trainee, int8_sgms, moment).items():
+        for plan in plans:
+            for layer, fidelity in measure_run(trainee, int8_sgms, frames[i], plan, [seed, i]):
                 measured[layer].append(fidelity)
     watch("measure", len(frames), len(frames))
     return {layer: mean_over_run(values) for layer, values in measured.items()}
 
 
+def measure_run(
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    demonstration: Demonstration,
+    plan: RunPlan,
+    seed: list[int],
+) -> Iterator[tuple[int, LayerFidelity]]:
+    """Every now and then along one run, what the SGMs that it is there for are worth."""
+
+    def driver(layer: int, seen: FloatArray) -> FloatArray:
+        if plan.maps:
+            return float_trace(trainee.sgms[layer], seen)[0]
+        return integer_forward(int8_sgms[layer], seen)[0]
+
+    every = MEASURE_MAPS_EVERY_STEPS if plan.maps else MEASURE_EVERY_STEPS
+    for moment in islice(run(trainee, demonstration, plan, seed, driver), 0, None, every):
+        yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
+
+
 def compare_moment(
-    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], moment: Moment
+    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], moment: Moment, layers: range
 ) -> dict[int, LayerFidelity]:
-    """Int8, float and true gradients on one batch, of all layers as they are at that moment."""
+    """Int8, float and true gradients on one batch behind `layers`, as they are at that moment."""
     true = true_gradients(moment.states, moment.features, moment.labels, trainee.checkpoint.loss)
     fidelity = {}
 
     def gradient(layer: int, seen: FloatArray) -> FloatArray:
-        int8, clipped = integer_forward(int8_sgms[layer], seen)
         floating, _ = float_trace(trainee.sgms[layer], seen)
-        fidelity[layer] = compare(int8, floating, true[layer][0, :, 0].numpy(), clipped)
-        return int8
+        if layer in layers:
+            int8, clipped = integer_forward(int8_sgms[layer], seen)
+            fidelity[layer] = compare(int8, floating, true[layer][0].numpy(), clipped)
+        return floating
 
     still = [torch.zeros(())] * len(moment.states)
     step(trainee, moment, still, gradient)
@@ -366,21 +418,20 @@ def compare_moment(
 def run(
     trainee: Trainee,
     demonstration: Demonstration,
-    tuned: int,
+    plan: RunPlan,
     seed: list[int],
-    epochs: int,
     sgm_gradient: SgmGradient,
 ) -> Iterator[Moment]:
-    """Fine-tune the last `tuned` layers on one frame as the device does; yields before every step.
+    """Fine-tune the last layers on one frame as the device does; yields before every step.
 
     Raises QsgmError when the run diverges.
     """
-    task = trainee.task(demonstration, tuned, seed)
-    states = trainee.start(tuned)
-    rates = torch.tensor(trainee.checkpoint.rates[tuned])
-    done, steps = 0, epochs * -(-len(task.labels) // BATCH)
+    task = trainee.task(demonstration, plan, seed)
+    states = trainee.start(plan.tuned)
+    rates = torch.tensor(trainee.checkpoint.rates[str(single_layers(plan.tuned))])
+    done, steps = 0, plan.epochs * -(-len(task.labels) // BATCH)
     generator = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**31)))
-    for _ in range(epochs):
+    for _ in range(plan.epochs):
         for rows in torch.randperm(len(task.labels), generator=generator).split(BATCH):
             moment = Moment(states, task.features[None, rows], task.labels[None, rows])
             yield moment
@@ -408,17 +459,35 @@ def step(
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == LAYERS:
             return loss_gradient(loss, activation, labels[:, :, None])
-        seen = torch.cat([activation[0, :, 0], labels[0]], dim=1).numpy()
-        return torch.from_numpy(sgm_gradient(layer, seen))[None, :, None]
+        filled = labels[0, :, None].expand(-1, activation.shape[2], -1)
+        seen = torch.cat([activation[0], filled], dim=2).numpy()
+        return torch.from_numpy(sgm_gradient(layer, seen))[None]
 
-    return local_step(moment.states, moment.features, moment.labels, rates, gradient_of, MOMENTUM)
+    return local_step(
+        moment.states,
+        moment.features,
+        moment.labels,
+        rates,
+        gradient_of,
+        MOMENTUM,
+        trainee.checkpoint.curvatures,
+    )
 
 
 def float_trace(sgm: FoldedSgm, seen: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-    """A 1x1 SGM in float: inputs (B, Ci) to gradient (B, C) and hidden tensors (B, H)."""
+    """An SGM in float: inputs (B, P, Ci) to gradient (B, P, C) and hidden tensors (B, P, H)."""
     x, hidden = seen, []
     for conv in sgm.convs[:-1]:
-        x = np.maximum(x @ conv.weight[:, :, 0, 0].T + conv.bias, 0)
+        x = np.maximum(float_product(conv, x), 0)
         hidden.append(x)
-    last = sgm.convs[-1]
-    return x @ last.weight[:, :, 0, 0].T + last.bias, hidden
+    return float_product(sgm.convs[-1], x), hidden
+
+
+def float_product(conv: FoldedConv, x: FloatArray) -> FloatArray:
+    """A padded convolution of square maps (B, P, I), by torch unless it is 1x1: (B, P, O)."""
+    if conv.weight.shape[2] == 1:
+        flat = x.reshape(-1, x.shape[2]) @ conv.weight[:, :, 0, 0].T + conv.bias
+        return flat.reshape(*x.shape[:2], -1)
+    side = round(x.shape[1] ** 0.5)
+    maps = torch.from_numpy(x).transpose(1, 2).unflatten(2, (side, side))
+    return run_folded_conv(conv, maps).flatten(2).transpose(1, 2).contiguous().numpy()

@@ -4,6 +4,7 @@ import json
 import struct
 import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from math import isfinite
@@ -13,19 +14,21 @@ from typing import Any, get_args
 import torch
 
 from qsgm.angles import AngleEncoding
+from qsgm.blocks import LAYERS, parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
+from qsgm.train.curvature import Curvature
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.sgm import SGM_LAYERS, Sgm
 
 FORMAT = "qsgm-checkpoint"
-VERSION = 1
+VERSION = 2
 LARGEST_BYTES = 64 * 2**20
 MOST_HIDDEN, WIDEST_HIDDEN = 4, 1024
-MOST_TUNED = 3
 _MEND = "make one with `qsgm pretrain -o sgm.pt`"
 # What parts of a wrong type, size or shape raise on their way into modules and numbers.
 _UNFIT = (
+    QsgmError,
     LookupError,
     TypeError,
     ValueError,
@@ -38,13 +41,39 @@ _UNFIT = (
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What pretraining hands on; batchnorm not folded, everything in eval mode."""
+    """What pretraining hands on; batchnorm not folded, everything in eval mode.
+
+    Raises:
+        ValueError: SGMs or rates do not go together. Rates are needed for any number of layers,
+            each a block of its own (`6`, `5,6`, ...), and may be given for other blocks.
+    """
 
     net: GraspNet
-    sgms: dict[int, Sgm]  # by the layer they stand behind
+    sgms: Mapping[int, Sgm]  # by the layer they stand behind: the last ones but layer 6
+    curvatures: Mapping[int, Curvature]  # by layer; a layer without one descends plainly
     loss: Loss
-    rates: dict[int, tuple[float, ...]]  # of SGD, by number of tuned layers; first layer first
+    rates: dict[str, tuple[float, ...]]  # of SGD, by blocks such as `4,5,6`; first layer first
     card: dict[str, Any]  # how it was made, and its figures; plain JSON
+
+    def __post_init__(self) -> None:
+        last = [*range(LAYERS - len(self.sgms), LAYERS)]
+        if sorted(self.sgms) != last:
+            raise ValueError(f"SGMs stand behind layers {sorted(self.sgms)}, not behind {last}")
+        counts = {text: len(rates) for text, rates in self.rates.items()}
+        for tuned in range(1, self.most_layers + 1):
+            if str(single_layers(tuned)) not in counts:
+                raise ValueError(f"there are no rates for layers {single_layers(tuned)}")
+        for text, count in counts.items():
+            layers = len(parse_blocks(text).layers)
+            if count != layers or layers > self.most_layers:
+                raise ValueError(
+                    f"{count} rates for layers {text}, of which {self.most_layers} can be tuned"
+                )
+
+    @property
+    def most_layers(self) -> int:
+        """The largest number of layers that can be tuned."""
+        return len(self.sgms) + 1
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -55,8 +84,9 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "net": checkpoint.net.state_dict(),
         "sgms": {layer: sgm.state_dict() for layer, sgm in checkpoint.sgms.items()},
         "hidden": {layer: list(sgm.hidden) for layer, sgm in checkpoint.sgms.items()},
+        "curvatures": {k: list(one.matrices) for k, one in checkpoint.curvatures.items()},
         "loss": asdict(checkpoint.loss),
-        "rates": {tuned: list(rates) for tuned, rates in checkpoint.rates.items()},
+        "rates": {blocks: list(rates) for blocks, rates in checkpoint.rates.items()},
         "card": json.dumps(checkpoint.card),
     }
     buffer = BytesIO()
@@ -77,14 +107,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
         net = GraspNet()
         net.load_state_dict(data["net"])
         sgms = {layer: _sgm(layer, data) for layer in data["sgms"]}
+        curvatures = {layer: _curvature(layer, data) for layer in data["curvatures"]}
         loss, rates = _loss(data["loss"]), _rates(data["rates"])
         card = dict(json.loads(data["card"]))
+        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card)
     except _UNFIT as error:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"
         ) from error
     _check_finite(path, net, *sgms.values())
-    return Checkpoint(net.eval(), sgms, loss, rates, card)
+    _check_curvatures(path, curvatures)
+    return checkpoint
 
 
 def _read(path: Path) -> Any:
@@ -133,6 +166,17 @@ def _sgm(layer: Any, data: dict[str, Any]) -> Sgm:
     return sgm.eval()
 
 
+def _curvature(layer: Any, data: dict[str, Any]) -> Curvature:
+    if type(layer) is not int or not 1 <= layer <= LAYERS:
+        raise ValueError(f"there is no layer {layer!r} to have a curvature")
+    plain = Curvature.identity(layer)
+    curvature = Curvature(*data["curvatures"][layer])
+    for matrix, expected in zip(curvature.matrices, plain.matrices, strict=True):
+        if (matrix.shape, matrix.dtype) != (expected.shape, expected.dtype):
+            raise ValueError(f"a curvature matrix of layer {layer} has another shape or type")
+    return curvature
+
+
 def _hidden(widths: Any) -> list[int]:
     """Checked before anything of these widths is made."""
     if not isinstance(widths, list | tuple) or not 1 <= len(widths) <= MOST_HIDDEN:
@@ -154,13 +198,10 @@ def _loss(fields: Any) -> Loss:
     return loss
 
 
-def _rates(by_tuned: Any) -> dict[int, tuple[float, ...]]:
-    if sorted(by_tuned) != list(range(1, MOST_TUNED + 1)):
-        raise ValueError(f"the rates are not for 1 to {MOST_TUNED} tuned layers")
-    rates = {int(tuned): tuple(map(_number, of_layers)) for tuned, of_layers in by_tuned.items()}
-    for tuned, of_layers in rates.items():
-        if len(of_layers) != tuned or min(of_layers) <= 0:
-            raise ValueError(f"the rates for {tuned} layer(s) are not {tuned} positive number(s)")
+def _rates(by_blocks: Any) -> dict[str, tuple[float, ...]]:
+    rates = {str(text): tuple(map(_number, of_layers)) for text, of_layers in by_blocks.items()}
+    if not all(rate > 0 for of_layers in rates.values() for rate in of_layers):
+        raise ValueError("a rate is not positive")
     return rates
 
 
@@ -174,6 +215,14 @@ def _one_line(error: BaseException) -> str:
     """The start of what an error says, or its kind where that cannot be shown."""
     first = next(iter(str(error).splitlines()), "")[:160]
     return first if first and first.isprintable() else type(error).__name__
+
+
+def _check_curvatures(path: Path, curvatures: Mapping[int, Curvature]) -> None:
+    for layer, curvature in curvatures.items():
+        if not all(torch.isfinite(matrix).all() for matrix in curvature.matrices):
+            raise QsgmError(
+                f"{path}: the curvature of layer {layer} holds NaN or infinity; {_MEND}"
+            )
 
 
 def _check_finite(path: Path, *modules: torch.nn.Module) -> None:

@@ -7,7 +7,7 @@ same frames give the same bytes.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,12 @@ import numpy as np
 import torch
 from onnx import ModelProto
 
+from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import (
     FORMAT,
     MANIFEST,
     NETWORK,
+    PRECISIONS,
     VERSION,
     OptimizerName,
     Precision,
@@ -26,14 +28,12 @@ from qsgm.bundle import (
     probe_file,
     step_file,
     trunk_file,
-    tuned_layers,
 )
 from qsgm.crops import cut_crops, label_crops, plan_crops
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.train.calibrate import (
     EPOCHS,
-    MOST_LAYERS,
     CalibrationSet,
     Demonstration,
     Trainee,
@@ -42,22 +42,24 @@ from qsgm.train.calibrate import (
     measure,
     prepare,
 )
-from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.checkpoint import Checkpoint, load_checkpoint
+from qsgm.train.curvature import FLAT
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
 from qsgm.train.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
-from qsgm.train.graphs.step import AnySgm, backprop_step_model, step_model
+from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
-from qsgm.train.graspnet import LAYERS, normalize
+from qsgm.train.graspnet import normalize
 from qsgm.train.quantize import QuantizedSgm, quantize_sgm
 
 SEED = 0
 # No other folder that qsgm writes holds a file of this name; `manifest.json` is in two kinds.
 MARKER = trunk_file(1)
 OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
-TUNED = range(1, MOST_LAYERS + 1)
+# Exported beside each layer on its own, as far as the checkpoint can tune so many layers.
+GROUPED = ("4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6")
 # Folding moves rounding errors about, no more: larger than this, it went wrong.
 LARGEST_FOLD_ERROR = 1e-4  # relative to the largest output
 FOLD_CROPS = 64
@@ -72,6 +74,7 @@ def fold_and_quantize(
     output_folder: Path,
     watch: Watch,
     epochs: int = EPOCHS,
+    blocks: Sequence[Blocks] = (),
 ) -> ExportReport:
     """Export a checkpoint as a bundle.
 
@@ -81,6 +84,7 @@ def fold_and_quantize(
         output_folder: absent, empty, or an earlier bundle.
         watch: told about progress.
         epochs: length of each fine-tuning run that ranges are taken along.
+        blocks: to be tuned beside :data:`GROUPED` and each layer on its own.
 
     Raises:
         QsgmError: the checkpoint or the calibration set cannot be used, the output folder holds
@@ -88,12 +92,13 @@ def fold_and_quantize(
     """
     check_replaceable(output_folder, MARKER)
     trainee = prepare(load_checkpoint(checkpoint_path))
+    exported = exported_blocks(trainee.checkpoint.most_layers, blocks)
     frames = CalibrationSet(calib_folder)
     fold_error = check_folding(trainee, frames[0])
     ranges = calibrate(trainee, frames, SEED, watch, epochs)
     int8_sgms = {k: quantize_sgm(sgm, ranges[k]) for k, sgm in trainee.sgms.items()}
     fidelity = measure(trainee, int8_sgms, frames, SEED, watch, epochs)
-    graphs = build_graphs(trainee, int8_sgms)
+    graphs = build_graphs(trainee, int8_sgms, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)
     files = {name: model.SerializeToString() for name, model in graphs.items()}
@@ -116,7 +121,7 @@ def fold_and_quantize(
     with new_folder(output_folder, MARKER) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
-        manifest = json.dumps(describe(trainee, files), indent=1, sort_keys=True)
+        manifest = json.dumps(describe(trainee, exported, files), indent=1, sort_keys=True)
         (new / MANIFEST).write_text(manifest + "\n")
         (new / "README.md").write_text(model_card(report, provenance))
     return report
@@ -156,38 +161,58 @@ def refuse_large_error(what: str, error: float, outputs: torch.Tensor) -> None:
         )
 
 
-def build_graphs(trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm]) -> dict[str, ModelProto]:
+def exported_blocks(most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
+    """What the bundle can tune with SGMs; raises QsgmError where that is not possible.
+
+    First every number of layers, each layer on its own, then the groups.
+    """
+    for blocks in more:
+        if len(blocks.layers) > most_layers or not blocks.sgm_layers:
+            raise QsgmError(
+                f"cannot export steps for the blocks {blocks}: the checkpoint has SGMs for "
+                f"{most_layers} layers at most, and one has to stand behind a block"
+            )
+    grouped = [blocks for blocks in map(parse_blocks, GROUPED) if len(blocks.layers) <= most_layers]
+    singles = [single_layers(tuned) for tuned in range(1, most_layers + 1)]
+    return list(dict.fromkeys([*singles, *grouped, *more]))
+
+
+def build_graphs(
+    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], blocks: Sequence[Blocks]
+) -> dict[str, ModelProto]:
     """Every graph of a bundle, by file name."""
-    net, loss = trainee.net, trainee.checkpoint.loss
+    net, loss, most = trainee.net, trainee.checkpoint.loss, trainee.checkpoint.most_layers
     graphs = {NETWORK: network_model(net, loss.encoding)}
-    for tuned in TUNED:
+    for tuned in range(1, most + 1):
         graphs[trunk_file(tuned)] = trunk_model(net, LAYERS - tuned)
         graphs[head_file(tuned)] = head_model(net, tuned, loss.encoding)
-        graphs |= build_steps(trainee, int8_sgms, tuned)
         if tuned > 1:
             graphs[probe_file(tuned)] = probe_model(net, tuned, trainee.sgms, int8_sgms, loss)
+    for one in dict.fromkeys([*blocks, *map(one_block, range(1, most + 1))]):
+        graphs |= build_steps(trainee, int8_sgms, one)
     return graphs
 
 
 def build_steps(
-    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], tuned: int
+    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], blocks: Blocks
 ) -> dict[str, ModelProto]:
-    """The training steps of the last `tuned` layers; a single one has no SGM in it."""
+    """The training steps of these blocks; a single one has no SGM in it, and one precision."""
     net, loss = trainee.net, trainee.checkpoint.loss
     variants: dict[Precision, Mapping[int, AnySgm]] = {"int8": int8_sgms, "float": trainee.sgms}
-    steps = {}
-    for name, optimizer in OPTIMIZERS.items():
-        steps[step_file("bp", "float", name, tuned)] = backprop_step_model(
-            net, tuned, loss, optimizer
+    # Meta-trained with SGD and SGMs: neither Adam nor backpropagation uses it.
+    bent = {"sgd": trainee.checkpoint.curvatures if blocks.sgm_layers else FLAT, "adam": FLAT}
+    return {
+        step_file(precision, name, blocks): step_model(
+            net, blocks, variants[precision], loss, optimizer, bent[name]
         )
-        for precision, sgms in variants.items() if tuned > 1 else ():
-            steps[step_file("sgm", precision, name, tuned)] = step_model(
-                net, tuned, sgms, loss, optimizer
-            )
-    return steps
+        for precision in (PRECISIONS if blocks.sgm_layers else ("float",))
+        for name, optimizer in OPTIMIZERS.items()
+    }
 
 
-def describe(trainee: Trainee, files: Mapping[str, bytes]) -> dict[str, Any]:
+def describe(
+    trainee: Trainee, blocks: Sequence[Blocks], files: Mapping[str, bytes]
+) -> dict[str, Any]:
     """The manifest that :mod:`qsgm.bundle` reads."""
     loss = trainee.checkpoint.loss
     return {
@@ -195,12 +220,13 @@ def describe(trainee: Trainee, files: Mapping[str, bytes]) -> dict[str, Any]:
         "version": VERSION,
         "encoding": loss.encoding,
         "label_smoothing": loss.label_smoothing,
-        "most_layers": MOST_LAYERS,
+        "most_layers": trainee.checkpoint.most_layers,
+        "blocks": [str(one) for one in blocks],
         "files": {
             name: {"sha256": sha256(data), "bytes": len(data)} for name, data in files.items()
         },
         "initializers": places(trainee, files[NETWORK]),
-        "recipes": recipes(trainee.checkpoint.rates),
+        "recipes": recipes(trainee.checkpoint, blocks),
     }
 
 
@@ -208,24 +234,31 @@ def places(trainee: Trainee, network: bytes) -> dict[str, dict[str, Any]]:
     """Where the weights and biases that can be tuned lie in the network's file."""
     offsets = initializer_offsets(network)
     found = {}
-    for number in tuned_layers(MOST_LAYERS):
+    for number in tuned_layers(trainee.checkpoint.most_layers):
         layer = trainee.net.layers[number - 1]
         for name, array in ((f"weight{number}", layer.weight), (f"bias{number}", layer.bias)):
             found[name] = {"offset": offsets[name][0], "shape": list(array.shape)}
     return found
 
 
-def recipes(sgm_rates: Mapping[int, tuple[float, ...]]) -> dict[str, Any]:
-    """Default optimizer and rates of both methods, by number of tuned layers."""
+def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[str, Any]:
+    """Default optimizer and rates of both methods, by blocks."""
     sgm = {
-        "sgd": {str(tuned): list(sgm_rates[tuned]) for tuned in TUNED},
-        "adam": {str(tuned): [SGM_ADAM_RATE] * tuned for tuned in TUNED},
+        "sgd": {str(one): list(sgm_rates(checkpoint, one)) for one in blocks},
+        "adam": {str(one): [SGM_ADAM_RATE] * len(one.layers) for one in blocks},
     }
+    whole = [one_block(tuned) for tuned in range(1, checkpoint.most_layers + 1)]
     bp = {
-        name: {str(tuned): [rate] * tuned for tuned in TUNED}
+        name: {str(one): [rate] * len(one.layers) for one in whole}
         for name, rate in BACKPROP_RATES.items()
     }
     return {"sgm": {"optimizer": "sgd", "rates": sgm}, "bp": {"optimizer": "adam", "rates": bp}}
+
+
+def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:
+    """The checkpoint's for these blocks, else those for as many layers on their own."""
+    single = checkpoint.rates[str(single_layers(len(blocks.layers)))]
+    return checkpoint.rates.get(str(blocks), single)
 
 
 def sha256(data: bytes) -> str:

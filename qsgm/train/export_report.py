@@ -161,16 +161,16 @@ def model_card(report: ExportReport, provenance: Provenance) -> str:
     return f"""# GraspNet with int8 synthetic gradient modules
 
 Standard ONNX graphs for fine-tuning GraspNet on the device, feed-forward; `manifest.json` says what
-is in them. Batchnorm and pixel normalisation are folded into the convolutions (largest change of
-any output: {report.fold_max_abs_error:.1e}).
+is in them. Batchnorm is folded into the convolutions (largest change of any output:
+{report.fold_max_abs_error:.1e}), pixel normalisation into those of the trunks.
 
 | file | what |
 | --- | --- |
 | `network.onnx` | a frame to its heatmap |
 | `trunk_N.onnx` | crops to features, when the last N layers are tuned |
 | `head_N.onnx` | features to outputs |
-| `step_sgm_int8_*_N.onnx`, `step_sgm_float_*_N.onnx` | a training step with SGMs, SGD or Adam |
-| `step_bp_*_N.onnx` | the same step by backpropagation, for comparison |
+| `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step, SGD or Adam; B: layers in blocks |
+| `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
 | `probe_N.onnx` | int8, float and true gradients of a batch |
 
 ## Made from
@@ -191,7 +191,8 @@ How the checkpoint was pretrained, and what it scored:
 
 u8 activations, weights of two s8 planes (one holds what rounding to the other left), a scale for
 every channel (calibrator: {MinMax.name}), float gradients out. Measured while the int8 SGMs
-fine-tuned the last three layers on the calibration frames. {LEGEND.capitalize()}.
+fine-tuned the last three layers on the calibration frames; behind layers 1 to 3, where there are
+SGMs, on batches along shorter runs of all layers. {LEGEND.capitalize()}.
 
 {lines}
 """

@@ -1,8 +1,9 @@
-"""Fold batchnorm, and the pixel normalisation, into the convolutions in front of them.
+"""Fold batchnorm into the convolutions in front of it.
 
 Batchnorm with running statistics is an affine map per channel, so a convolution can absorb it.
-The network's first layer also absorbs x / 127.5 - 1: it has no padding, so every window sees the
-same offset and the folded network takes raw pixels. Sums are done in float64, results are float32.
+Where the first layer is frozen it can absorb x / 127.5 - 1 as well (:func:`on_pixels`): it has no
+padding, so every window sees the same offset. Tuned it sees pixels in [-1, 1], as in pretraining:
+the same rate means other steps on raw pixels. Sums are done in float64, results are float32.
 
 Contract. Before: every batchnorm stands right behind a convolution and has finite running
 statistics with a positive variance. After: convolutions, biases, ReLU and pooling, nothing else.
@@ -10,7 +11,7 @@ statistics with a positive variance. After: convolutions, biases, ReLU and pooli
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -41,7 +42,7 @@ class FoldedLayer:
 
 @dataclass(frozen=True)
 class FoldedNet:
-    """The six layers; the first takes raw BGR pixel values, 0 to 255."""
+    """The six layers; the first takes BGR pixels in [-1, 1], see :func:`on_pixels`."""
 
     layers: tuple[FoldedLayer, ...]
 
@@ -61,19 +62,22 @@ class FoldedSgm:
     layer: int
     convs: tuple[FoldedConv, ...]
 
+    @property
+    def kernel(self) -> int:
+        """Side of all its windows: 3 behind layers 1 to 3, where maps are, else 1."""
+        return int(self.convs[0].weight.shape[2])
+
 
 def fold_net(net: GraspNet) -> FoldedNet:
-    """Fold batchnorm and pixel normalisation. Raises QsgmError where the contract is broken."""
+    """Fold batchnorm. Raises QsgmError where the contract is broken."""
     layers = [layer for layer in net.layers if isinstance(layer, Layer)]
     refuse_other_norms(net, (layer.norm for layer in layers))
     return FoldedNet(tuple(fold_layer(number, layer) for number, layer in enumerate(layers, 1)))
 
 
 def fold_layer(number: int, layer: Layer) -> FoldedLayer:
-    """One layer, numbered from 1; the first absorbs the pixel normalisation as well."""
+    """One layer, numbered from 1."""
     weight, bias = as_float64(layer.conv)
-    if number == 1:
-        weight, bias = absorb_input_affine(weight, bias, PIXEL_SCALE, PIXEL_OFFSET)
     if layer.norm is not None:
         weight, bias = absorb_norm(weight, bias, layer.norm, f"layer {number}")
     return FoldedLayer(
@@ -82,6 +86,19 @@ def fold_layer(number: int, layer: Layer) -> FoldedLayer:
         relu=layer.norm is not None,
         pool=1 if layer.pool is None else POOL,
     )
+
+
+def on_pixels(net: FoldedNet) -> FoldedNet:
+    """The same network on raw BGR pixel values, 0 to 255: the first layer normalises them."""
+    first = net.layers[0]
+    weight = first.weight.astype(np.float64)
+    bias = first.bias + PIXEL_OFFSET * weight.sum(axis=(1, 2, 3))
+    absorbed = replace(
+        first,
+        weight=(weight * PIXEL_SCALE).astype(np.float32),
+        bias=bias.astype(np.float32),
+    )
+    return FoldedNet((absorbed, *net.layers[1:]))
 
 
 def fold_sgm(sgm: Sgm) -> FoldedSgm:
@@ -119,7 +136,7 @@ def sgm_fold_error(sgm: Sgm, folded: FoldedSgm, activation: Tensor, labels: Tens
 
 def run_folded(folded: FoldedNet, crops: Tensor) -> Tensor:
     """Raw outputs (N, 3, rows, cols) of the folded network on pixels (N, H, W, 3)."""
-    x = crops.permute(0, 3, 1, 2).float()
+    x = normalize(crops)
     for layer in folded.layers:
         x = F.conv2d(x, torch.tensor(layer.weight), torch.tensor(layer.bias), layer.stride)
         x = F.relu(x) if layer.relu else x
@@ -167,13 +184,6 @@ def as_float32(where: str, weight: Tensor, bias: Tensor) -> tuple[FloatArray, Fl
             " a smaller learning rate"
         )
     return weight.float().numpy(), bias.float().numpy()
-
-
-def absorb_input_affine(
-    weight: Tensor, bias: Tensor, scale: float, offset: float
-) -> tuple[Tensor, Tensor]:
-    """The convolution that does to x what the given one does to scale * x + offset (no padding)."""
-    return weight * scale, bias + offset * weight.sum(dim=(1, 2, 3))
 
 
 def absorb_norm(

@@ -11,18 +11,20 @@ Every channel has a scale of its own, and none of them costs anything at run tim
 4. Folded-in scales spread a row's weights so far apart that one s8 plane would cost more than all
    activations' rounding together. A second plane holds what the first one rounded away.
 
-Case 1 is exact for 1x1 kernels only: a padded kernel needs x = 0 at the border, while a u8 zero
-means x = low. Larger kernels are refused.
+Behind layers 1 to 3 kernels are padded, so that zero needs a code of its own: there [low, high] is
+widened until it has one (:func:`with_zero`). Weights are in their windows' order, (kh, kw, I).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.train.fold import FloatArray, FoldedSgm
+from qsgm.weights import to_step_layout
 
 U8_MAX = 255
 S8_MAX = 127
@@ -37,6 +39,7 @@ SMALLEST_SCALE = 1e-30
 CLIP_TOLERANCE_STEPS = 0.5
 
 Float64Array = NDArray[np.float64]
+Number = TypeVar("Number", np.uint8, np.float32)
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class SgmRanges:
 
 @dataclass(frozen=True)
 class QuantizedProduct:
-    """u8 (N, I) -> float (N, O): (x @ weight.T + bias) * scale + (x @ fine.T) * fine_scale.
+    """u8 windows (I) -> float (O): (x @ weight.T + bias) * scale + (x @ fine.T) * fine_scale.
 
     Both sums are in int32. Together the planes give a weight 16 bits, sign included, while each
     takes part in a u8 x s8 product. The bias can do with the coarse scale: what rounding costs
@@ -73,6 +76,7 @@ class QuantizedSgm:
     """The SGM behind layer `layer`, ready for integers: u8 = round((x - low) * gain)."""
 
     layer: int
+    kernel: int  # side of all its windows
     input_low: FloatArray  # (Ci,)
     input_gain: FloatArray  # (Ci,), u8 steps per unit
     products: tuple[QuantizedProduct, ...]  # ReLU between
@@ -83,39 +87,42 @@ class QuantizedSgm:
 def quantize_sgm(sgm: FoldedSgm, ranges: SgmRanges) -> QuantizedSgm:
     """Fold all tensors' channel scales into the weights and round those.
 
-    Raises QsgmError for kernels larger than 1x1 and for ranges that do not fit the SGM.
+    Raises QsgmError for ranges that do not fit the SGM.
     """
-    check_kernels(sgm)
     check_ranges(sgm, ranges)
     low = ranges.input_low.astype(np.float32)
     span, dead_inputs = live_span(ranges.input_high.astype(np.float64) - low)
+    if sgm.kernel > 1:
+        low, span = with_zero(low, span)
     hidden = [live_span(high.astype(np.float64)) for high in ranges.hidden_high]
 
-    weights = [conv.weight[:, :, 0, 0].astype(np.float64) for conv in sgm.convs]
+    weights = [to_step_layout(conv.weight).astype(np.float64) for conv in sgm.convs]
     biases = [conv.bias.astype(np.float64) for conv in sgm.convs]
-    biases[0] += weights[0] @ low.astype(np.float64)
+    taps = sgm.kernel**2  # a window holds every channel so many times
+    biases[0] += weights[0] @ np.tile(low.astype(np.float64), taps)
     # The weights absorb the very gains that the graph will use, rounded to float32 as they are.
     gain = (U8_MAX / span).astype(np.float32)
     # What one step of each tensor's channels stands for; the gradient stays what it is.
     steps = [1 / gain.astype(np.float64), *(high / U8_MAX for high, _ in hidden)]
     steps.append(np.ones(len(weights[-1])))
     products = (
-        quantize_product(weight * into / out[:, None], bias / out)
+        quantize_product(weight * np.tile(into, taps) / out[:, None], bias / out)
         for weight, bias, into, out in zip(weights, biases, steps, steps[1:], strict=False)
     )
     dead_hidden = tuple(dead for _, dead in hidden)
-    return QuantizedSgm(sgm.layer, low, gain, tuple(products), dead_inputs, dead_hidden)
+    return QuantizedSgm(sgm.layer, sgm.kernel, low, gain, tuple(products), dead_inputs, dead_hidden)
 
 
-def check_kernels(sgm: FoldedSgm) -> None:
-    """Raise QsgmError unless every convolution is 1x1."""
-    for conv in sgm.convs:
-        if conv.weight.shape[2:] != (1, 1):
-            raise QsgmError(
-                f"the SGM behind layer {sgm.layer} has a {conv.weight.shape[2]}x"
-                f"{conv.weight.shape[3]} kernel: only 1x1 can be quantized (layers 4 and 5);"
-                " leave it in float"
-            )
+def with_zero(low: FloatArray, span: Float64Array) -> tuple[FloatArray, Float64Array]:
+    """Low ends and spans of ranges, no smaller than these, in which 0 is exactly a u8 code.
+
+    Activations behind a ReLU get the code 0 for it, labels from -1 to 1 the code 127.
+    """
+    low, high = np.minimum(low, 0), np.maximum(low + span, 0)
+    code = np.floor(-low * U8_MAX / (high - low))
+    below = code > 0  # less than a step below zero is nothing that int8 could tell from zero
+    low = np.where(below, low, 0).astype(np.float32)
+    return low, np.where(below, -low * U8_MAX / np.maximum(code, 1), high)
 
 
 def check_ranges(sgm: FoldedSgm, ranges: SgmRanges) -> None:
@@ -173,10 +180,10 @@ def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, fl
 
     Args:
         q: the quantized SGM.
-        inputs: float32 (N, Ci): activation and label side by side.
+        inputs: float32 (N, P, Ci): activation and label side by side, at P positions of a square.
 
     Returns:
-        Gradients float32 (N, C), and the fraction of inputs that lay outside their range.
+        Gradients float32 (N, P, C), and the fraction of inputs that lay outside their range.
     """
     gradient, _, clipped = integer_trace(q, inputs)
     return gradient, clipped
@@ -185,14 +192,16 @@ def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, fl
 def integer_trace(
     q: QuantizedSgm, inputs: FloatArray
 ) -> tuple[FloatArray, list[NDArray[np.uint8]], float]:
-    """:func:`integer_forward` with the hidden tensors, u8 (N, H), between its results."""
+    """:func:`integer_forward` with the hidden tensors, u8 (N, P, H), between its results."""
     scaled = (inputs - q.input_low) * q.input_gain
     outside = (scaled < -CLIP_TOLERANCE_STEPS) | (scaled > U8_MAX + CLIP_TOLERANCE_STEPS)
-    rounded = [to_u8(scaled)]
+    zero = to_u8((0 - q.input_low) * q.input_gain)
+    x, hidden = padded_windows(to_u8(scaled), q.kernel, zero), []
     for product in q.products[:-1]:
         # ReLU is the clipping at zero: a u8 with zero point 0 holds nothing below it.
-        rounded.append(to_u8(integer_product(product, rounded[-1])))
-    return integer_product(q.products[-1], rounded[-1]), rounded[1:], float(outside.mean())
+        hidden.append(to_u8(integer_product(product, x)))
+        x = padded_windows(hidden[-1], q.kernel, np.zeros_like(product.bias))
+    return integer_product(q.products[-1], x), hidden, float(outside.mean())
 
 
 def to_u8(x: FloatArray) -> NDArray[np.uint8]:
@@ -200,13 +209,29 @@ def to_u8(x: FloatArray) -> NDArray[np.uint8]:
     return np.clip(np.rint(x), 0, U8_MAX).astype(np.uint8)
 
 
-def integer_product(product: QuantizedProduct, x: NDArray[np.uint8]) -> FloatArray:
-    """u8 (N, I) to float32 (N, O): each plane's sum exact in int32, rounded from there on.
+def padded_windows(x: NDArray[Number], kernel: int, frame: NDArray[Any]) -> NDArray[Number]:
+    """Every position's window (N, P, kernel * kernel * C) of square maps (N, P, C).
 
-    That is four times in float32: both sums, their products with the scales, added.
+    Around the maps every position holds `frame` (C,). For 1x1 they are returned as they are.
     """
-    wide = x.astype(np.int32)
-    coarse = wide @ product.weight.T.astype(np.int32) + product.bias
-    fine = wide @ product.fine.T.astype(np.int32)
+    if kernel == 1:
+        return x
+    count, positions, channels = x.shape
+    side, pad = round(positions**0.5), kernel // 2
+    framed = np.tile(frame.astype(x.dtype), (count, side + 2 * pad, side + 2 * pad, 1))
+    framed[:, pad:-pad, pad:-pad] = x.reshape(count, side, side, channels)
+    windows = np.lib.stride_tricks.sliding_window_view(framed, (kernel, kernel), axis=(1, 2))
+    return windows.transpose(0, 1, 2, 4, 5, 3).reshape(count, positions, -1)
+
+
+def integer_product(product: QuantizedProduct, x: NDArray[np.uint8]) -> FloatArray:
+    """u8 (..., I) to float32 (..., O): each plane's sum exact, rounded from there on.
+
+    That is four times in float32: both sums, their products with the scales, added. The sums are
+    integers in float64, which holds them as exactly as int32 does and has the quicker product.
+    """
+    wide = x.astype(np.float64)
+    coarse = wide @ product.weight.T.astype(np.float64) + product.bias
+    fine = wide @ product.fine.T.astype(np.float64)
     scaled = coarse.astype(np.float32) * product.scale
     return scaled + fine.astype(np.float32) * product.fine_scale

@@ -26,7 +26,7 @@ from qsgm.bundle import NETWORK, Bundle, load_bundle
 from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
 from qsgm.finetuning import SLICE
 from qsgm.images import read_demonstration
-from qsgm.train.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss
+from qsgm.train.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss, normalize
 from qsgm.tuning import BATCH, batches, rate_factor
 
 RATE = 1e-3  # Adam's, as the paper has it
@@ -92,7 +92,7 @@ def see(
         start = time.perf_counter()
         crops = cut_crops(frame, plan[first : first + SLICE])
         cut = time.perf_counter()
-        x = torch.from_numpy(crops).permute(0, 3, 1, 2).float()
+        x = normalize(torch.from_numpy(crops))
         features.append(forward(frozen, 1, x))
         seconds["crops"] += cut - start
         seconds["features"] += time.perf_counter() - cut

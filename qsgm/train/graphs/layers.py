@@ -2,7 +2,9 @@
 
 Activations are position-major, (B, P, C). A convolution is a gather of windows (im2col) and one
 matrix product, and its weight gradient is another product with the same windows: a Conv whose
-weight is an input, or a Conv for the gradient, takes several times as long in ONNX Runtime.
+weight is an input, or a Conv for the gradient, takes several times as long in ONNX Runtime. Back
+to a layer's input it is the other way round: ConvTranspose takes a fifth to a half of the time of
+gathering or scattering the windows' gradients.
 """
 
 from dataclasses import dataclass
@@ -10,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from onnx import TensorProto
 
-from qsgm.errors import QsgmError
-from qsgm.train.fold import FoldedLayer, FoldedNet
+from qsgm.blocks import tuned_layers
+from qsgm.train.curvature import Curvature
+from qsgm.train.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
 from qsgm.train.graphs.build import Graph, Ops, Value
-from qsgm.train.graspnet import LAYERS
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
-TUNABLE = (1, 2, 3)  # how many of the last layers a graph can train
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,19 @@ class TunedLayer:
         return len(self.folded.bias)
 
     @property
+    def before_side(self) -> int:
+        """Of the map that its convolution makes of a crop."""
+        return output_side(self.side, self.kernel, self.folded.stride)
+
+    @property
     def positions(self) -> int:
-        """Windows in its input map, which its pool, if any, averages to one."""
-        return output_side(self.side, self.kernel, self.folded.stride) ** 2
+        """Windows in its input map."""
+        return self.before_side**2
+
+    @property
+    def after_side(self) -> int:
+        """Of the map behind its pool, which of a crop covers the whole map."""
+        return 1 if self.folded.pool > 1 else self.before_side
 
 
 @dataclass(frozen=True)
@@ -80,20 +91,10 @@ def input_side(net: FoldedNet, number: int) -> int:
     return side
 
 
-def first_tuned(tuned: int) -> int:
-    """The number of the first of the last `tuned` layers.
-
-    Raises QsgmError for more than three: further ahead maps are larger than one position.
-    """
-    if tuned not in TUNABLE:
-        raise QsgmError(f"cannot tune the last {tuned} layers: choose 1, 2 or 3")
-    return LAYERS - tuned + 1
-
-
 def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]:
     """The last `tuned` layers, their weights and biases declared as inputs."""
     layers = []
-    for number in range(first_tuned(tuned), LAYERS + 1):
+    for number in tuned_layers(tuned):
         folded = net.layers[number - 1]
         shape = to_step_layout(folded.weight).shape
         weight = graph.input(f"weight{number}", np.float32, shape)
@@ -103,10 +104,22 @@ def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]
 
 
 def declare_features(graph: Graph, net: FoldedNet, tuned: int) -> Value:
-    """Input of the first tuned layer, for all crops: (N, P, C)."""
-    number = first_tuned(tuned)
-    channels = net.layers[number - 1].weight.shape[1]
-    return graph.input("features", np.float32, ("crops", input_side(net, number) ** 2, channels))
+    """Input of the first tuned layer, for all crops: (N, P, C), float32; of layer 1 the pixels."""
+    number = tuned_layers(tuned)[0]
+    shape = ("crops", input_side(net, number) ** 2, net.layers[number - 1].weight.shape[1])
+    return graph.input("features", np.uint8 if number == 1 else np.float32, shape)
+
+
+def as_seen(op: Ops, features: Value, tuned: int) -> Value:
+    """Features as the first tuned layer sees them: pixels become float32 in [-1, 1]."""
+    if tuned_layers(tuned)[0] > 1:
+        return features
+    return normalized(op, op.Cast(features, to=TensorProto.FLOAT))
+
+
+def normalized(op: Ops, pixels: Value) -> Value:
+    """Pixel values 0 to 255 to [-1, 1]."""
+    return op.Add(op.Mul(pixels, op.constant(PIXEL_SCALE)), op.constant(PIXEL_OFFSET))
 
 
 def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
@@ -116,20 +129,24 @@ def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
     share = op.Reciprocal(op.Cast(op.Size(rows), to=TensorProto.FLOAT))
-    return Batch(op.Gather(features, rows, axis=0), op.Gather(labels, rows, axis=0), share)
+    seen = as_seen(op, op.Gather(features, rows, axis=0), tuned)
+    return Batch(seen, op.Gather(labels, rows, axis=0), share)
+
+
+def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Value:
+    """All windows of square maps (B, side * side, C): (B, rows, columns, kernel * kernel, C)."""
+    # Stored as a sum of three small tensors, which the runtime folds when it loads.
+    start, step = np.arange(0, side - kernel + 1, stride), np.arange(kernel)
+    row = op.constant(side * start[:, None, None], np.int64)
+    column = op.constant(start[:, None], np.int64)
+    offset = op.constant((side * step[:, None] + step).ravel(), np.int64)
+    return op.Gather(x, op.Add(op.Add(row, column), offset), axis=1)
 
 
 def cut_windows(op: Ops, layer: TunedLayer, x: Value) -> Value:
     """The windows (B * P, K) that a layer sees of its input (B, P_in, Ci)."""
     if layer.kernel > 1:
-        # Stored as a sum of two small tensors, which the runtime folds when it loads.
-        side, stride = layer.side, layer.folded.stride
-        start = np.arange(0, side - layer.kernel + 1, stride)
-        base = (start[:, None] * side + start).reshape(-1, 1)
-        step = np.arange(layer.kernel)
-        offset = (step[:, None] * side + step).reshape(1, -1)
-        index = op.Add(op.constant(base, np.int64), op.constant(offset, np.int64))
-        x = op.Gather(x, index, axis=1)
+        x = gather_windows(op, x, layer.side, layer.kernel, layer.folded.stride)
     return op.Reshape(x, op.shape(-1, layer.width))
 
 
@@ -158,7 +175,34 @@ def weight_gradients(op: Ops, done: Pass, dz: Value) -> tuple[Value, Value]:
     return op.Gemm(dz, done.windows, transA=1), op.ReduceSum(dz, op.shape(0), keepdims=0)
 
 
+def bend(
+    op: Ops, layer: TunedLayer, curvature: Curvature, d_weight: Value, d_bias: Value
+) -> tuple[Value, Value]:
+    """Gradients (Co, K) and (Co,) along the layer's curvature, as `Curvature.bend` has them."""
+    window, into, out, bias = (matrix.numpy() for matrix in curvature.matrices)
+    if layer.kernel == 1:  # one position: its factor goes with another matrix
+        windows = op.MatMul(d_weight, op.constant(window[0, 0] * into))
+    else:
+        maps = op.Reshape(d_weight, op.shape(layer.channels, len(window), len(into)))
+        windows = op.MatMul(op.constant(window.T), op.MatMul(maps, op.constant(into)))
+        windows = op.Reshape(windows, op.shape(layer.channels, layer.width))
+    return op.MatMul(op.constant(out.T), windows), op.MatMul(d_bias, op.constant(bias))
+
+
 def gradient_before(op: Ops, layer: TunedLayer, dz: Value) -> Value:
-    """dz (B, C) of a 1x1 layer on one position, carried back to its input (B, 1, Ci)."""
-    assert (layer.kernel, layer.positions) == (1, 1), "only 1x1 layers are carried back"
-    return op.Unsqueeze(op.Gemm(dz, layer.weight), op.shape(1))
+    """dz (B * P, C) carried back to the layer's input: (B, P_in, Ci)."""
+    into, kernel, side = layer.folded.weight.shape[1], layer.kernel, layer.side
+    as_input = op.shape(-1, side**2, into)
+    if kernel == 1:
+        return op.Reshape(op.Gemm(dz, layer.weight), as_input)
+    weight = op.Reshape(layer.weight, op.shape(-1, kernel, kernel, into))
+    maps = op.Reshape(dz, op.shape(-1, layer.before_side, layer.before_side, layer.channels))
+    unseen = (side - kernel) % layer.folded.stride  # rows that no window reaches
+    before = op.ConvTranspose(
+        op.Transpose(maps, perm=(0, 3, 1, 2)),
+        op.Transpose(weight, perm=(0, 3, 1, 2)),
+        kernel_shape=(kernel, kernel),
+        strides=(layer.folded.stride, layer.folded.stride),
+        output_padding=(unseen, unseen),
+    )
+    return op.Reshape(op.Transpose(before, perm=(0, 2, 3, 1)), as_input)

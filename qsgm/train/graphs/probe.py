@@ -6,6 +6,7 @@ import numpy as np
 from onnx import ModelProto
 
 from qsgm.angles import AngleEncoding
+from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.train.fold import FoldedNet, FoldedSgm
 from qsgm.train.graphs.build import Graph
@@ -13,9 +14,12 @@ from qsgm.train.graphs.layers import (
     Batch,
     Pass,
     TunedLayer,
+    as_seen,
     declare_batch,
     declare_features,
     declare_layers,
+    gradient_before,
+    through_activation,
 )
 from qsgm.train.graphs.loss import activate, loss_and_error
 from qsgm.train.graphs.sgm import (
@@ -25,7 +29,7 @@ from qsgm.train.graphs.sgm import (
     scaled_inputs,
     sgm_inputs,
 )
-from qsgm.train.graphs.step import backward, forward_all, sgms_behind
+from qsgm.train.graphs.step import forward_all, sgms_behind
 from qsgm.train.graspnet import Loss
 from qsgm.train.quantize import QuantizedSgm
 
@@ -37,28 +41,29 @@ def probe_model(
     int8_sgms: Mapping[int, QuantizedSgm],
     loss: Loss,
 ) -> ModelProto:
-    """Gradients on the activation behind every SGM, each sample's own.
+    """Gradients on every tuned layer's activation but the last one's, each sample's own.
 
     Inputs are those of :mod:`qsgm.train.graphs.step` without rates and moments. Outputs for every
-    SGM's layer k: `true{k}`, `float{k}`, `int8{k}`, each (B, C), and `clipped{k}`, the fraction of
-    the int8 SGM's inputs that lay outside its ranges.
+    SGM's layer k: `true{k}`, `float{k}`, `int8{k}`, each (B, P, C), and `clipped{k}`, the fraction
+    of the int8 SGM's inputs that lay outside its ranges.
 
     Raises:
         QsgmError: fewer than two layers are tuned, so that there is no SGM, or one is missing.
     """
     if tuned < 2:
         raise QsgmError(
-            f"cannot probe the SGMs of {tuned} tuned layers: the last layer has none; choose 2 or 3"
+            f"cannot probe the SGMs of {tuned} tuned layers: the last layer has none; choose more"
         )
+    blocks = single_layers(tuned)
+    sgms_behind(blocks, float_sgms), sgms_behind(blocks, int8_sgms)
     graph = Graph("probe")
     layers = declare_layers(graph, net, tuned)
-    sgms_behind(layers, float_sgms), sgms_behind(layers, int8_sgms)
     batch = declare_batch(graph, net, tuned)
     passes = forward_all(graph, layers, batch.features)
     probe_truth(graph, layers, passes, batch, loss)
     for layer, done in zip(layers[:-1], passes[:-1], strict=True):
         number = layer.number
-        probe_sgm(graph, done, batch, float_sgms[number], int8_sgms[number])
+        probe_sgm(graph, layer, done, batch, float_sgms[number], int8_sgms[number])
     return graph.model()
 
 
@@ -66,8 +71,9 @@ def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProt
     """`features` (N, P, C) and the tuned layers to `outputs` (N, 3): quality, sine, cosine."""
     graph = Graph("head")
     layers = declare_layers(graph, net, tuned)
-    passes = forward_all(graph, layers, declare_features(graph, net, tuned))
     op = graph.within("head")
+    features = as_seen(op, declare_features(graph, net, tuned), tuned)
+    passes = forward_all(graph, layers, features)
     activated = activate(op, op.Squeeze(passes[-1].after, op.shape(1)), encoding)
     graph.output("outputs", op.Concat(*activated, axis=1), np.float32, ("crops", 3))
     return graph.model()
@@ -80,21 +86,29 @@ def probe_truth(
     op = graph.within("truth")
     raw = op.Squeeze(passes[-1].after, op.shape(1))
     _, error = loss_and_error(op, loss, raw, batch.labels)
-    gradients = backward(graph, layers, passes, op.Unsqueeze(error, op.shape(1)))
-    for layer, gradient in zip(layers[:-1], gradients[:-1], strict=True):
-        flat = op.Squeeze(gradient, op.shape(1))
-        graph.output(f"true{layer.number}", flat, np.float32, ("batch", layer.channels))
+    gradient = op.Unsqueeze(error, op.shape(1))
+    for layer, done, before in list(zip(layers[1:], passes[1:], layers, strict=False))[::-1]:
+        op = graph.within(f"layer{layer.number}/back")
+        gradient = gradient_before(op, layer, through_activation(op, layer, done, gradient))
+        shape = "batch", before.after_side**2, before.channels
+        graph.output(f"true{before.number}", gradient, np.float32, shape)
 
 
 def probe_sgm(
-    graph: Graph, done: Pass, batch: Batch, float_one: FoldedSgm, int8_one: QuantizedSgm
+    graph: Graph,
+    layer: TunedLayer,
+    done: Pass,
+    batch: Batch,
+    float_one: FoldedSgm,
+    int8_one: QuantizedSgm,
 ) -> None:
     """Declare `float{k}`, `int8{k}` and `clipped{k}` of one layer."""
-    number, shape = float_one.layer, ("batch", len(float_one.convs[-1].bias))
+    number, side = layer.number, layer.after_side
+    shape = "batch", side**2, layer.channels
     op = graph.within(f"layer{number}/float")
-    seen = sgm_inputs(op, done.after, batch)
-    graph.output(f"float{number}", float_sgm(op, float_one, seen), np.float32, shape)
+    seen = sgm_inputs(op, done.after, side, batch)
+    graph.output(f"float{number}", float_sgm(op, float_one, side, seen), np.float32, shape)
     op = graph.within(f"layer{number}/int8")
-    scaled = scaled_inputs(op, int8_one, seen)
-    graph.output(f"int8{number}", int8_sgm(op, int8_one, scaled), np.float32, shape)
-    graph.output(f"clipped{number}", clipped_fraction(op, scaled), np.float32, ())
+    graph.output(f"int8{number}", int8_sgm(op, int8_one, side, seen), np.float32, shape)
+    clipped = clipped_fraction(op, scaled_inputs(op, int8_one, seen))
+    graph.output(f"clipped{number}", clipped, np.float32, ())

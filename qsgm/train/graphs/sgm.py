@@ -1,75 +1,101 @@
 """A static SGM in a graph, in float and in int8.
 
-Both take what the SGM sees, concatenated, as (B, Ci), and answer with gradients (B, C): behind
-layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product.
+Both take what the SGM sees, a map position by position, (B, P, Ci), and answer with gradients
+(B, P, C). Behind layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product.
+Behind layers 1 to 3 they differ: in float the weights are constants, so that a Conv is quickest;
+ONNX Runtime has no integer Conv with a float result, so int8 cuts windows for a matrix product.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.errors import QsgmError
-from qsgm.train.fold import FloatArray, FoldedConv, FoldedSgm
+from qsgm.train.fold import FloatArray, FoldedSgm
 from qsgm.train.graphs.build import Ops, Value
-from qsgm.train.graphs.layers import Batch
+from qsgm.train.graphs.layers import Batch, gather_windows
 from qsgm.train.quantize import CLIP_TOLERANCE_STEPS, U8_MAX, QuantizedProduct, QuantizedSgm
 
 
-def sgm_gradient(op: Ops, sgm: FoldedSgm | QuantizedSgm, after: Value, batch: Batch) -> Value:
-    """The gradient (B, 1, C) that the SGM gives for an activation (B, 1, C)."""
-    seen = sgm_inputs(op, after, batch)
+def sgm_gradient(
+    op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, batch: Batch
+) -> Value:
+    """The gradient (B, P, C) that the SGM gives for an activation of as many, P = side * side."""
+    seen = sgm_inputs(op, after, side, batch)
     if isinstance(sgm, QuantizedSgm):
-        gradient = int8_sgm(op, sgm, scaled_inputs(op, sgm, seen))
-    else:
-        gradient = float_sgm(op, sgm, seen)
-    return op.Unsqueeze(gradient, op.shape(1))
+        return int8_sgm(op, sgm, side, seen)
+    return float_sgm(op, sgm, side, seen)
 
 
-def sgm_inputs(op: Ops, after: Value, batch: Batch) -> Value:
-    """Activation (B, 1, C) and label side by side: (B, Ci)."""
-    return op.Concat(op.Squeeze(after, op.shape(1)), batch.labels, axis=1)
+def sgm_inputs(op: Ops, after: Value, side: int, batch: Batch) -> Value:
+    """Activation (B, P, C) and label, the same at every position, side by side: (B, P, Ci)."""
+    labels = op.Unsqueeze(batch.labels, op.shape(1))
+    return op.Concat(after, op.Expand(labels, op.shape(1, side**2, 1)), axis=2)
 
 
-def float_sgm(op: Ops, sgm: FoldedSgm, seen: Value) -> Value:
-    """Products with ReLU between. Raises QsgmError for kernels larger than 1x1."""
-    x = float_product(op, sgm, sgm.convs[0], seen)
-    for conv in sgm.convs[1:]:
-        x = float_product(op, sgm, conv, op.Relu(x))
-    return x
+def float_sgm(op: Ops, sgm: FoldedSgm, side: int, seen: Value) -> Value:
+    """Inputs (B, P, Ci) through all convolutions, with ReLU between: (B, P, C)."""
+    inputs, channels = sgm.convs[0].weight.shape[1], len(sgm.convs[-1].bias)
+    if sgm.kernel == 1:
+        x = op.Reshape(seen, op.shape(-1, inputs))
+        for i, conv in enumerate(sgm.convs):
+            weight, bias = op.constant(conv.weight[:, :, 0, 0]), op.constant(conv.bias)
+            x = op.Gemm(op.Relu(x) if i else x, weight, bias, transB=1)
+        return op.Reshape(x, op.shape(-1, side**2, channels))
+    x = op.Transpose(op.Reshape(seen, op.shape(-1, side, side, inputs)), perm=(0, 3, 1, 2))
+    for i, conv in enumerate(sgm.convs):
+        weight, bias = op.constant(conv.weight), op.constant(conv.bias)
+        x = op.Conv(op.Relu(x) if i else x, weight, bias, pads=[sgm.kernel // 2] * 4)
+    return op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, side**2, channels))
 
 
-def float_product(op: Ops, sgm: FoldedSgm, conv: FoldedConv, x: Value) -> Value:
-    """x (B, I) to (B, O)."""
-    if conv.weight.shape[2:] != (1, 1):
-        raise QsgmError(
-            f"the SGM behind layer {sgm.layer} is not 1x1: only layers 4 and 5 have one"
-        )
-    return op.Gemm(x, op.constant(conv.weight[:, :, 0, 0]), op.constant(conv.bias), transB=1)
+def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
+    """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale.
+
+    ReLU costs no node: rounding to u8 clips at zero. Padding is real zeros in front of the first
+    product, where they have a code of their own, and the code 0 in front of the others.
+    """
+    x = op.Reshape(seen, op.shape(-1, len(sgm.input_low)))
+    x = as_u8(op, scaled_inputs(op, sgm, padded(op, x, side, sgm.kernel, len(sgm.input_low))))
+    for product in sgm.products[:-1]:
+        hidden = as_u8(op, int8_product(op, product, u8_windows(op, x, side, sgm.kernel, product)))
+        x = padded(op, hidden, side, sgm.kernel, len(product.bias))
+    last = sgm.products[-1]
+    gradient = int8_product(op, last, u8_windows(op, x, side, sgm.kernel, last))
+    return op.Reshape(gradient, op.shape(-1, side**2, len(last.bias)))
+
+
+def padded(op: Ops, x: Value, side: int, kernel: int, channels: int) -> Value:
+    """Positions (B * P, C) of square maps with zeros around them, (B, P', C); for 1x1 as they are.
+
+    Numbers of either type: of float32 a real zero, of u8 the code 0.
+    """
+    if kernel == 1:
+        return x
+    pad = kernel // 2
+    maps = op.Reshape(x, op.shape(-1, side, side, channels))
+    framed = op.Pad(maps, op.shape(0, pad, pad, 0, 0, pad, pad, 0))
+    return op.Reshape(framed, op.shape(-1, (side + 2 * pad) ** 2, channels))
 
 
 def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
-    """Inputs (B, Ci) with each channel's calibrated range spread over 0..255, not rounded yet."""
+    """Inputs (..., Ci) with each channel's calibrated range spread over 0..255, not rounded yet."""
     return op.Mul(op.Sub(seen, op.constant(sgm.input_low)), op.constant(sgm.input_gain))
 
 
-def int8_sgm(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:
-    """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale.
-
-    ReLU costs no node: rounding to u8 clips at zero.
-    """
-    x = scaled
-    for product in sgm.products:
-        x = int8_product(op, product, as_u8(op, x))
-    return x
-
-
 def as_u8(op: Ops, x: Value) -> Value:
-    """Round to u8 with scale 1 and zero point 0, and back: what the runtime turns into integers."""
-    scale, zero_point = op.constant(1.0), op.constant(0, np.uint8)
-    return op.DequantizeLinear(op.QuantizeLinear(x, scale, zero_point), scale, zero_point)
+    """Round to u8 with scale 1 and zero point 0."""
+    return op.QuantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
+
+
+def u8_windows(op: Ops, x: Value, side: int, kernel: int, product: QuantizedProduct) -> Value:
+    """Windows (B * P, K) of :func:`padded` u8 maps, as what the runtime turns into integers."""
+    if kernel > 1:
+        windows = gather_windows(op, x, side + 2 * (kernel // 2), kernel, stride=1)
+        x = op.Reshape(windows, op.shape(-1, product.weight.shape[1]))
+    return op.DequantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
 
 
 def int8_product(op: Ops, product: QuantizedProduct, x: Value) -> Value:
-    """x (B, I) to (B, O), both planes added as float.
+    """Windows (B * P, I) to (B * P, O), both planes added as float.
 
     The bias has the coarse plane's scale, exactly: the input's scale is 1.
     """
@@ -93,7 +119,7 @@ def s8_plane(op: Ops, plane: NDArray[np.int8], scale: FloatArray) -> Value:
 
 
 def clipped_fraction(op: Ops, scaled: Value) -> Value:
-    """Share of scaled inputs (B, Ci) further outside 0..255 than rounding explains; a scalar."""
+    """Share of scaled inputs further outside 0..255 than rounding explains; a scalar."""
     middle, reach = U8_MAX / 2, U8_MAX / 2 + CLIP_TOLERANCE_STEPS
     outside = op.Greater(op.Abs(op.Sub(scaled, op.constant(middle))), op.constant(reach))
     ones = op.Where(outside, op.constant(1.0), op.constant(0.0))

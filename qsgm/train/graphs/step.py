@@ -1,9 +1,9 @@
-"""A whole training step as one graph: layer-local, or by backpropagation as the baseline.
+"""A whole training step as one graph, block by block; one block is backpropagation.
 
 Inputs: `features` (N, P, C) and `labels` (N, 3) of all crops; `rows` (B,), the batch; one scalar
 `rate{k}` per layer; and the state, in which `weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the
-layer's and everything else starts at zero (all float32; which inputs are state shows in the
-outputs' names).
+layer's and everything else starts at zero. All are float32, but for features that are pixels,
+uint8. Which inputs are state shows in the outputs' names.
 Outputs: every state under its name with `_next`; `loss`, the batch's mean before the update.
 """
 
@@ -12,13 +12,16 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto
 
+from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
+from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.fold import FoldedNet, FoldedSgm
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import (
     Batch,
     Pass,
     TunedLayer,
+    bend,
     declare_batch,
     declare_layers,
     forward,
@@ -36,64 +39,58 @@ AnySgm = FoldedSgm | QuantizedSgm
 
 
 def step_model(
-    net: FoldedNet, tuned: int, sgms: Mapping[int, AnySgm], loss: Loss, optimizer: Optimizer
+    net: FoldedNet,
+    blocks: Blocks,
+    sgms: Mapping[int, AnySgm],
+    loss: Loss,
+    optimizer: Optimizer,
+    curvatures: Mapping[int, Curvature] = FLAT,
 ) -> ModelProto:
-    """A feed-forward step: every layer updates itself before the next one runs.
+    """A feed-forward step: every block updates itself before the next one runs.
 
     Args:
         net: gives the geometry; its weights are inputs of the graph.
-        tuned: how many of the last layers are trained, 1 to 3.
-        sgms: by layer, float or int8; one for each tuned layer but the last.
-        loss: gives the last layer its gradient.
+        blocks: which of the last layers are trained, and how far true gradients are carried back.
+        sgms: by layer, float or int8; one behind every block but the last.
+        loss: gives the last block its gradient.
         optimizer: updates each parameter.
+        curvatures: by layer, where gradients are bent before the optimizer sees them.
 
     Raises:
-        QsgmError: for another number of layers, or an SGM too few.
+        QsgmError: an SGM is missing.
     """
-    graph = Graph("local_step")
-    layers = declare_layers(graph, net, tuned)
-    used = sgms_behind(layers, sgms)
-    batch = declare_batch(graph, net, tuned)
+    graph = Graph("step")
+    layers = {layer.number: layer for layer in declare_layers(graph, net, len(blocks.layers))}
+    used = sgms_behind(blocks, sgms)
+    batch = declare_batch(graph, net, len(blocks.layers))
     rule = optimizer.rule(graph)
     x = batch.features
-    for layer in layers[:-1]:
-        op = graph.within(f"layer{layer.number}")
-        done = forward(op, layer, x)
-        gradient = sgm_gradient(op, used[layer.number], done.after, batch)
-        update_layer(op, layer, done, gradient, batch, optimizer, rule)
-        x = done.after
-    op = graph.within(f"layer{layers[-1].number}")
-    done = forward(op, layers[-1], x)
-    error = report_loss(op, loss, done, batch)
-    update_layer(op, layers[-1], done, error, batch, optimizer, rule)
+    for group in blocks.groups:
+        block = [layers[number] for number in group]
+        passes = forward_all(graph, block, x)
+        op, x = graph.within(f"layer{group[-1]}"), passes[-1].after
+        if group[-1] in used:
+            gradient = sgm_gradient(op, used[group[-1]], block[-1].after_side, x, batch)
+        else:
+            gradient = report_loss(op, loss, x, batch)
+        # Divided by the batch here, where the gradient is smallest: the rest is sums.
+        shared = op.Mul(gradient, batch.share)
+        update_block(graph, block, passes, shared, curvatures, optimizer, rule)
     return graph.model()
 
 
-def backprop_step_model(net: FoldedNet, tuned: int, loss: Loss, optimizer: Optimizer) -> ModelProto:
-    """The same step with true gradients, carried back through all tuned layers."""
-    graph = Graph("backprop_step")
-    layers = declare_layers(graph, net, tuned)
-    batch = declare_batch(graph, net, tuned)
-    rule = optimizer.rule(graph)
-    passes = forward_all(graph, layers, batch.features)
-    error = report_loss(graph.within("loss"), loss, passes[-1], batch)
-    gradients = backward(graph, layers, passes, error)
-    for layer, done, gradient in zip(layers, passes, gradients, strict=True):
-        op = graph.within(f"layer{layer.number}")
-        update_layer(op, layer, done, gradient, batch, optimizer, rule)
-    return graph.model()
-
-
-def sgms_behind(layers: list[TunedLayer], sgms: Mapping[int, AnySgm]) -> dict[int, AnySgm]:
-    """The SGM of every tuned layer but the last. Raises QsgmError where one is missing."""
-    numbers = [layer.number for layer in layers[:-1]]
-    if missing := [number for number in numbers if number not in sgms]:
-        raise QsgmError(f"no SGM for layers {missing}: tuning needs one behind each of {numbers}")
-    return {number: sgms[number] for number in numbers}
+def sgms_behind(blocks: Blocks, sgms: Mapping[int, AnySgm]) -> dict[int, AnySgm]:
+    """The SGM behind every block but the last. Raises QsgmError where one is missing."""
+    if missing := [number for number in blocks.sgm_layers if number not in sgms]:
+        raise QsgmError(
+            f"no SGM for layers {missing}: tuning {blocks} needs one behind each of"
+            f" {[*blocks.sgm_layers]}"
+        )
+    return {number: sgms[number] for number in blocks.sgm_layers}
 
 
 def forward_all(graph: Graph, layers: list[TunedLayer], x: Value) -> list[Pass]:
-    """All tuned layers' forward passes, kept for :func:`backward`."""
+    """All these layers' forward passes, kept for the way back."""
     passes = []
     for layer in layers:
         passes.append(forward(graph.within(f"layer{layer.number}"), layer, x))
@@ -101,38 +98,41 @@ def forward_all(graph: Graph, layers: list[TunedLayer], x: Value) -> list[Pass]:
     return passes
 
 
-def backward(
-    graph: Graph, layers: list[TunedLayer], passes: list[Pass], error: Value
-) -> list[Value]:
-    """Every layer's gradient on its activation (B, P', C), each sample's own."""
-    gradients = [error]
-    for layer, done in list(zip(layers, passes, strict=True))[:0:-1]:
-        op = graph.within(f"layer{layer.number}/back")
-        dz = through_activation(op, layer, done, gradients[0])
-        gradients.insert(0, gradient_before(op, layer, dz))
-    return gradients
-
-
-def report_loss(op: Ops, loss: Loss, last: Pass, batch: Batch) -> Value:
+def report_loss(op: Ops, loss: Loss, raw: Value, batch: Batch) -> Value:
     """Declare the output `loss`; return each sample's error, d loss / d raw outputs (B, 1, 3)."""
-    mean, error = loss_and_error(op, loss, op.Squeeze(last.after, op.shape(1)), batch.labels)
+    mean, error = loss_and_error(op, loss, op.Squeeze(raw, op.shape(1)), batch.labels)
     op.graph.output("loss", mean, np.float32, ())
     return op.Unsqueeze(error, op.shape(1))
 
 
-def update_layer(
-    op: Ops,
-    layer: TunedLayer,
-    done: Pass,
+def update_block(
+    graph: Graph,
+    layers: list[TunedLayer],
+    passes: list[Pass],
     gradient: Value,
-    batch: Batch,
+    curvatures: Mapping[int, Curvature],
     optimizer: Optimizer,
     rule: Rule,
 ) -> None:
-    """One layer's update from each sample's gradient on its activation (B, P', C)."""
-    # Divided by the batch here, where the gradient is smallest: the rest is sums.
-    dz = through_activation(op, layer, done, op.Mul(gradient, batch.share))
-    d_weight, d_bias = weight_gradients(op, done, dz)
+    """All these layers' updates, from the gradient (B, P', C) on the last one's activation.
+
+    It is carried back with the weights as they were.
+    """
+    for layer, done in list(zip(layers, passes, strict=True))[::-1]:
+        op = graph.within(f"layer{layer.number}")
+        dz = through_activation(op, layer, done, gradient)
+        gradients = weight_gradients(op, done, dz)
+        if layer.number in curvatures:
+            gradients = bend(op, layer, curvatures[layer.number], *gradients)
+        update_layer(op, layer, *gradients, optimizer, rule)
+        if layer is not layers[0]:
+            gradient = gradient_before(op, layer, dz)
+
+
+def update_layer(
+    op: Ops, layer: TunedLayer, d_weight: Value, d_bias: Value, optimizer: Optimizer, rule: Rule
+) -> None:
+    """One layer's update from the gradients (Co, K) and (Co,) of its weight and bias."""
     rate = op.graph.input(f"rate{layer.number}", np.float32, ())
     for value, kind, d_value in ((layer.weight, "weight", d_weight), (layer.bias, "bias", d_bias)):
         shape = (layer.channels, layer.width) if kind == "weight" else (layer.channels,)

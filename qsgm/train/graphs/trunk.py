@@ -5,29 +5,33 @@ from onnx import ModelProto, TensorProto
 
 from qsgm.angles import AngleEncoding
 from qsgm.errors import QsgmError
-from qsgm.train.fold import FoldedNet
+from qsgm.train.fold import FoldedNet, on_pixels
 from qsgm.train.graphs.build import Graph, Value
-from qsgm.train.graphs.layers import CROP_SIDE, input_side
+from qsgm.train.graphs.layers import CROP_SIDE, input_side, normalized
 from qsgm.train.graphs.loss import activate
 
 
 def trunk_model(net: FoldedNet, last_frozen: int) -> ModelProto:
     """`crops` uint8 (N, 128, 128, 3) BGR to `features` (N, P, C), position by position.
 
-    The features are the output of layer `last_frozen`.
+    The features are the output of layer `last_frozen`; for 0, where nothing is, the pixels, uint8.
     """
     graph = Graph("trunk")
     crops = graph.input("crops", np.uint8, ("crops", CROP_SIDE, CROP_SIDE, 3))
     op = graph.within("trunk")
+    shape = input_side(net, last_frozen + 1) ** 2, net.layers[last_frozen].weight.shape[1]
+    if last_frozen == 0:
+        graph.output(
+            "features", op.Reshape(crops, op.shape(-1, *shape)), np.uint8, ("crops", *shape)
+        )
+        return graph.model()
     x = op.Cast(op.Transpose(crops, perm=(0, 3, 1, 2)), to=TensorProto.FLOAT)
+    # Not normalised in the graph: that would take a third as long again as the whole trunk.
+    frozen = on_pixels(net)
     for number in range(1, last_frozen + 1):
-        x = constant_layer(graph, net, number, x)
-    positions, channels = (
-        input_side(net, last_frozen + 1) ** 2,
-        len(net.layers[last_frozen - 1].bias),
-    )
-    features = op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, positions, channels))
-    graph.output("features", features, np.float32, ("crops", positions, channels))
+        x = constant_layer(graph, frozen, number, x)
+    features = op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, *shape))
+    graph.output("features", features, np.float32, ("crops", *shape))
     return graph.model()
 
 
@@ -41,7 +45,7 @@ def network_model(net: FoldedNet, encoding: AngleEncoding) -> ModelProto:
     frame = graph.input("frame", np.uint8, ("height", "width", 3))
     op = graph.within("frame")
     planes = op.Unsqueeze(op.Transpose(frame, perm=(2, 0, 1)), op.shape(0))
-    x = op.Cast(planes, to=TensorProto.FLOAT)
+    x = normalized(op, op.Cast(planes, to=TensorProto.FLOAT))
     for number in range(1, len(net.layers) + 1):
         x = constant_layer(graph, net, number, x)
     heatmap = op.Squeeze(op.Concat(*activate(op, x, encoding), axis=1), op.shape(0))
