@@ -22,7 +22,7 @@ from qsgm.bench.scenes import ON_OBJECT_PX, SceneResult, ScenesReport
 from qsgm.bench.speed import measure_speed, ratios
 from qsgm.bench.staging import BORDER_PX, CutOut, Scene, cut_out, make_scenes, put_down
 from qsgm.blocks import single_layers
-from qsgm.bundle import Bundle, Recipe, step_file
+from qsgm.bundle import Bundle, Recipe, load_bundle, step_file
 from qsgm.finetuning import Settings, finetune, prepare, train
 from qsgm.images import write_png
 from qsgm.predict import Detection
@@ -412,3 +412,35 @@ def test_a_frame_that_cannot_serve_as_a_demonstration_is_refused(tmp_path: Path)
         flat.read()
     with pytest.raises(QsgmError, match="too small for a demonstration"):
         small.read()
+
+
+def test_layers_are_compared_on_every_frame_division_by_division(
+    bundle_folder: Path, frames_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["bench", "layers", "--frames", str(frames_folder), "--bundle", str(bundle_folder)]
+    arguments += ["--epochs", "1", "--blocks", "4,5,6", "--blocks", "4,5-6"]
+    assert cli.run([*arguments, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert list(report["blocks"]) == ["4,5,6", "4,5-6"]
+    for row in report["blocks"].values():
+        assert len(row["per_frame"]) == len(report["frames"])
+        mean = np.mean(row["per_frame"], axis=0)
+        assert row["all"]["detection_accuracy"] == pytest.approx(mean[0], abs=1e-3)
+        assert row["all"]["angle_mae_deg"] == pytest.approx(mean[1], abs=1e-3)
+    same = finetune(
+        list_frames(frames_folder)[0].read(),
+        load_bundle(bundle_folder),
+        Settings(layers=3, blocks="4,5-6", epochs=1),
+    )
+    angle = report["blocks"]["4,5-6"]["per_frame"][0][1]
+    assert angle == pytest.approx(same.accuracy.angle_mae_deg, abs=1e-3)
+    assert cli.run(arguments) == 0
+    assert "4,5-6" in capsys.readouterr().out
+
+
+def test_blocks_that_a_bundle_lacks_are_refused_before_anything_is_measured(
+    bundle_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["bench", "layers", "--bundle", str(bundle_folder), "--blocks", "3-5,6"]
+    assert cli.run(arguments) == 1
+    assert "has no step for the blocks 3-5,6" in capsys.readouterr().err

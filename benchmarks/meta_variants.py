@@ -1,0 +1,150 @@
+"""What each part of the meta-training is worth: variants of it, from the same regressed SGMs.
+
+    python benchmarks/meta_variants.py sgm.pt [--steps 600] [--only NAME ...]
+
+Takes the checkpoint's network, regresses SGMs on drawn objects, meta-trains them in the way of each
+variant, and fine-tunes three layers for elongated drawn objects of another seed, for 1, 3 and 20
+epochs. Prints the angle error [deg] of each, and every SGM's cosine to the true gradient, the mean
+along the longest run. Backpropagation: the best of a few rates for every run length.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+from torch.nn import functional as F
+
+from qsgm.train.baselines.backpropagation import Backpropagation
+from qsgm.train.baselines.tuning import Recipe, adam, run_baseline, sgd
+from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.evaluate import UpdateRule, fine_tune, score
+from qsgm.train.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.local import LayerState, columns, layer_forward, true_gradients
+from qsgm.train.maml import MamlConfig, MetaTraining
+from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.objects import draw_frame
+from qsgm.train.pretrain import FIRST_RATES, TUNED
+from qsgm.train.sgm import Sgm
+from qsgm.train.start import folded_start
+from qsgm.train.tasks import TaskSet, draw_tasks
+
+EPOCHS = (1, 3, 20)
+TASKS, CROPS, SEED = 240, 400, 21
+TEST_TASKS, TEST_CROPS, LEAST_ELONGATION = 32, 1000, 1.6
+GRID = {sgd: (0.003, 0.01, 0.02, 0.03), adam: (0.001, 0.002, 0.003)}
+
+
+class PlainLoss(Loss):
+    """Meta-trains on the mean loss instead of `Loss.per_task`."""
+
+    def per_task(self, raw: Tensor, labels: Tensor) -> Tensor:
+        return self.per_sample(raw.flatten(0, 1), labels.flatten(0, 1)).view(len(raw), -1).mean(1)
+
+
+def variants(steps: int) -> dict[str, tuple[MamlConfig, Loss]]:
+    """By name, the first one as shipped but for the number of steps."""
+    usual = MamlConfig(outer_steps=steps)
+    return {
+        "as shipped": (usual, Loss()),
+        "plain loss": (usual, PlainLoss()),
+        "no curvature": (replace(usual, curvature_rate=0.0), Loss()),
+        "matching weight 1": (replace(usual, matching_weight=1.0), Loss()),
+        "matching weight 0": (replace(usual, matching_weight=0.0), Loss()),
+        "long runs only": (replace(usual, run_lengths=(500,)), Loss()),
+    }
+
+
+def regressed(net: GraspNet, tasks: TaskSet) -> dict[int, Sgm]:
+    """SGMs behind layers 4 and 5 after the second stage."""
+    config, start = MatchingConfig(), folded_start(net, TUNED)
+    examples = record_examples(tasks, start, (FIRST_RATES[0], 0, 0), Loss(), config, SEED)
+    torch.manual_seed(SEED)
+    sgms = {layer: Sgm(layer, (64, 64)) for layer in (4, 5)}
+    return {k: fit_sgm(sgm, examples[k], config, SEED, lambda: None) for k, sgm in sgms.items()}
+
+
+def elongated(tasks: TaskSet, seed: int) -> TaskSet:
+    """Those of the drawn tasks whose object has an axis."""
+    drawn = [draw_frame(np.random.default_rng((seed, i))) for i in range(len(tasks))]
+    rows = [i for i, frame in enumerate(drawn) if frame.elongation > LEAST_ELONGATION]
+    return TaskSet(tasks.features[rows], tasks.labels[rows], tasks.support)
+
+
+@torch.no_grad()
+def measure(rule: UpdateRule, start: list[tuple[Tensor, Tensor]], tasks: TaskSet) -> list[str]:
+    """Angle errors after each run length, then the mean cosines of the longest."""
+    cells, cosines = [], []
+    for epochs in EPOCHS:
+        angles = []
+        for some in tasks.chunks(8):
+            for states in fine_tune(rule, start, some, epochs):
+                if epochs == EPOCHS[-1]:
+                    cosines.append(cosine_to_truth(rule, states, some))
+            angles.append(score(states, some, rule.loss)[:, 2])
+        cells.append(f"{float(torch.cat(angles).mean()):.2f}")
+    return cells + [f"{value:.2f}" for value in torch.stack(cosines).mean(dim=0).tolist()]
+
+
+def cosine_to_truth(rule: UpdateRule, states: list[LayerState], tasks: TaskSet) -> Tensor:
+    """Of the SGMs behind layers 4 and 5 on one batch: (2,)."""
+    x, labels = tasks.features[:, :32].float(), tasks.labels[:, :32]
+    true = true_gradients(states, x, labels, rule.loss)
+    found = []
+    for layer, state in enumerate(states[:-1], LAYERS + 1 - TUNED):
+        _, x = layer_forward(layer, state, columns(layer, x))
+        given = rule.gradient_of(layer, x, labels)
+        found.append(F.cosine_similarity(given.flatten(1), true[layer].flatten(1)).mean())
+    return torch.stack(found)
+
+
+def best_backpropagation(start: list[tuple[Tensor, Tensor]], tasks: TaskSet) -> list[str]:
+    """The lowest angle error of the grid for each run length."""
+    cells = []
+    for epochs in EPOCHS:
+        recipes = [Recipe(o, (r,) * TUNED, epochs) for o, rates in GRID.items() for r in rates]
+        scores = [run_baseline(tasks, start, Backpropagation(), r, Loss(), 0) for r in recipes]
+        cells.append(f"{min(float(s[:, 2].mean()) for s in scores):.2f}")
+    return [*cells, "1", "1"]
+
+
+def main(path: Path, steps: int, only: list[str], show: Callable[[object], None]) -> None:
+    """Print a row per variant."""
+    torch.set_num_threads(1)
+    net = load_checkpoint(path).net
+    tasks = draw_tasks(net, TASKS, CROPS, SEED, Loss(), lambda: None)
+    test = elongated(
+        draw_tasks(net, TEST_TASKS, TEST_CROPS, SEED + 1, Loss(), lambda: None), SEED + 1
+    )
+    sgms = regressed(net, tasks)
+    table = Table("variant", *(f"{epochs} ep." for epochs in EPOCHS), "cos 4", "cos 5")
+    table.add_row("backpropagation", *best_backpropagation(folded_start(net, TUNED), test))
+    for name, (config, loss) in variants(steps).items():
+        if only and name not in only:
+            continue
+        fresh = {layer: Sgm(layer, sgm.hidden) for layer, sgm in sgms.items()}
+        for layer, sgm in fresh.items():
+            sgm.load_state_dict(sgms[layer].state_dict())
+        training = MetaTraining(
+            config, loss, tasks, folded_start(net, TUNED), fresh, FIRST_RATES, SEED
+        )
+        training.run(lambda *_: None)
+        rates = tuple(training.log_rates.detach().exp().tolist())
+        rule = UpdateRule(fresh, training.learnt_curvatures(), rates, Loss())
+        start = [(weight.detach(), bias.detach()) for weight, bias in training.start]
+        table.add_row(name, *measure(rule, start, test))
+        show(table)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--only", nargs="*", default=[])
+    given = parser.parse_args()
+    main(given.checkpoint, given.steps, given.only, Console().print)
