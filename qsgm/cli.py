@@ -363,6 +363,40 @@ def bench_accuracy(
         _write_report(values, pictures / "accuracy.json")
 
 
+@bench.command("layers")
+def bench_layers(
+    frames: FramesOption = None,
+    blocks: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B,C", help="Layers in groups; repeatable. Else: all singles."),
+    ] = None,
+    int8: PrecisionOption = None,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Static SGMs with more and more layers tuned, or in the blocks given, on every frame."""
+    from qsgm.bench.frames import list_frames
+    from qsgm.bench.layers import measure_layers
+
+    some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
+    loaded = _bundle(bundle)
+    asked = blocks or [text for text in loaded.blocks if "-" not in text]
+    divisions = [_blocks(text) for text in asked]
+    settings = _settings(
+        int8, MethodName.SGM, defaults.LAYERS, optimizer, epochs, seed, None, threads
+    )
+    with _progress() as watch:
+        report = measure_layers(some, loaded, settings, divisions, watch)
+    _show(report.to_json(), report.render(), as_json)
+    _write_report(report.to_json(), output)
+
+
 @bench.command("scenes")
 def bench_scenes(
     frames: FramesOption = None,
@@ -417,6 +451,36 @@ def bench_speed(
         report = measure_speed(frame, _bundle(bundle), settings, repeats, watch)
     _write_report(report, output)
     _show(report, render(report), as_json)
+
+
+@bench.command("baselines")
+def bench_baselines(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="sgm.pt", help="Gives the start and the static SGMs.")
+    ],
+    frames: FramesOption = None,
+    layers: Annotated[int, typer.Option(min=2, max=4, help="How many to tune.")] = defaults.LAYERS,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    output: ReportOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Other systems on the same crops: online SGMs, feedback alignment, target projection (host).
+
+    All in float and in torch, each at the best of a few optimizers and rates on these frames.
+    """
+    from qsgm.bench.frames import list_frames
+
+    host = _host_module("qsgm.train.baselines.comparison")
+    loaded = _host_module("qsgm.train.checkpoint").load_checkpoint(checkpoint)
+    some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
+    with _progress() as watch:
+        tasks = host.tasks_of(loaded, some, layers, seed, watch)
+        rows = host.compare(loaded, tasks, layers, epochs, seed, watch)
+    values = host.to_json(rows, len(some), epochs)
+    _show(values, host.render(rows, len(some)), as_json)
+    _write_report(values, output)
 
 
 @bench.command("paper")

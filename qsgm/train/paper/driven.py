@@ -1,0 +1,160 @@
+"""Layers that keep their batchnorm, trained by SGMs: the paper's own setting (section 3.2).
+
+A layer is updated by the gradient its SGM makes of its activation and the label. The true gradients
+are carried back beside, for SGMs that follow them. :class:`qsgm.train.sgm.SgmLayer` does this in a
+network's own backward pass; with several of them in a row, though, what reaches one is the next
+one's synthetic gradient. Here autograd goes back one layer at a time, so that all can follow the
+truth.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qsgm.train.evaluate import score
+from qsgm.train.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.maml import MOMENTUM
+from qsgm.train.sgm import Sgm
+from qsgm.train.start import folded_start
+from qsgm.train.tasks import TaskSet, shuffled_batches, start_states
+
+RATE = 1e-1  # paper section 4.2: of network and SGMs, in pretraining and fine-tuning
+Criterion = Callable[[Tensor, Tensor], Tensor]  # (synthetic, true) -> what an SGM lowers
+
+
+@dataclass(frozen=True)
+class CutPass:
+    """A batch through layers that autograd sees one at a time; mappings are by layer number."""
+
+    outputs: Mapping[int, Tensor]  # (N, C, H, W), each with its own layer's graph
+    true: Mapping[int, Tensor]  # gradient of the summed loss on each output
+    labels: Tensor  # (N, 3)
+
+
+class Driver(Protocol):
+    """Makes the gradients on the hidden layers' outputs."""
+
+    def gradients(self, seen: CutPass) -> Mapping[int, Tensor]:
+        """By layer, in the shape of its output (N, C, H, W)."""
+        ...
+
+
+class FollowingSgms:
+    """SGMs that answer, then take a step towards the true gradient; for one run.
+
+    Args:
+        sgms: by layer; they are changed.
+        criterion: l2 or l1 (section 4.2).
+    """
+
+    def __init__(self, sgms: Mapping[int, Sgm], criterion: Criterion = F.mse_loss) -> None:
+        self.sgms = {layer: sgm.train() for layer, sgm in sgms.items()}
+        self.criterion = criterion
+        parameters = [p for sgm in self.sgms.values() for p in sgm.parameters()]
+        self.optimizer = torch.optim.SGD(parameters, RATE, momentum=MOMENTUM)
+
+    def gradients(self, seen: CutPass) -> Mapping[int, Tensor]:
+        guess = {k: self.sgms[k](x.detach(), seen.labels) for k, x in _hidden(seen).items()}
+        self.optimizer.zero_grad()
+        for layer, gradient in guess.items():
+            self.criterion(gradient, seen.true[layer]).backward()
+        self.optimizer.step()
+        return {layer: gradient.detach() for layer, gradient in guess.items()}
+
+
+class FixedSgms:
+    """SGMs that answer and stay as they are."""
+
+    def __init__(self, sgms: Mapping[int, Sgm]) -> None:
+        self.sgms = {layer: sgm.eval() for layer, sgm in sgms.items()}
+
+    @torch.no_grad()
+    def gradients(self, seen: CutPass) -> Mapping[int, Tensor]:
+        return {layer: self.sgms[layer](x, seen.labels) for layer, x in _hidden(seen).items()}
+
+
+def cut_pass(layers: Mapping[int, nn.Module], x: Tensor, labels: Tensor, loss: Loss) -> CutPass:
+    """Run the last layers on maps (N, C, H, W) and carry the true gradients back."""
+    inputs: dict[int, Tensor] = {}
+    outputs: dict[int, Tensor] = {}
+    for number, layer in layers.items():
+        inputs[number] = x.detach().requires_grad_()
+        x = outputs[number] = layer(inputs[number])
+    total = loss.per_sample(x[:, :, 0, 0], labels).sum()
+    (gradient,) = torch.autograd.grad(total, x, retain_graph=True)
+    true = {LAYERS: gradient}
+    for number in list(layers)[:0:-1]:
+        (gradient,) = torch.autograd.grad(
+            outputs[number], inputs[number], gradient, retain_graph=True
+        )
+        true[number - 1] = gradient
+    return CutPass(outputs, true, labels)
+
+
+def driven_step(
+    layers: Mapping[int, nn.Module],
+    seen: CutPass,
+    driver: Driver,
+    optimizer: torch.optim.Optimizer,
+) -> None:
+    """Update every layer by the driver's gradients, the last one by the loss's own."""
+    given = {**driver.gradients(seen), LAYERS: seen.true[LAYERS]}
+    optimizer.zero_grad()
+    for number, layer in layers.items():
+        own = list(layer.parameters())  # no further: what lies before is cut off
+        seen.outputs[number].backward(given[number] / len(seen.labels), inputs=own)
+    optimizer.step()
+
+
+def tune_with_batchnorm(
+    net: GraspNet, tuned: int, driver: Driver, tasks: TaskSet, epochs: int, loss: Loss, seed: int
+) -> Tensor:
+    """Fine-tune a copy of the last layers at a constant 1e-1, batchnorm on batch statistics.
+
+    Args:
+        net: not changed.
+        tuned: how many of its layers.
+        driver: where gradients come from.
+        tasks: of one object; features are those behind the last frozen layer.
+        epochs: passes over the support crops.
+        loss: and with it the angle encoding.
+        seed: of the order of crops.
+
+    Returns:
+        (1, 3): objective, detection accuracy and angle error [deg] on the query crops, with
+        batchnorm on its running statistics.
+    """
+    net = deepcopy(net)
+    layers = last_layers(net, tuned)
+    optimizer = torch.optim.SGD(_parameters(layers), RATE, momentum=MOMENTUM)
+    maps = as_maps(tasks.features[0].float())
+    for rows in shuffled_batches(tasks.support, epochs, seed):
+        seen = cut_pass(layers, maps[rows], tasks.labels[0, rows], loss)
+        driven_step(layers, seen, driver, optimizer)
+    return score(start_states(folded_start(net.eval(), tuned), 1), tasks, loss)
+
+
+def last_layers(net: GraspNet, count: int) -> dict[int, nn.Module]:
+    """The last `count` layers by number, ready to train."""
+    numbers = range(LAYERS + 1 - count, LAYERS + 1)
+    return {number: net.layers[number - 1].train() for number in numbers}
+
+
+def as_maps(features: Tensor) -> Tensor:
+    """Features (N, P, C), P a square map, as (N, C, H, W)."""
+    side = round(features.shape[1] ** 0.5)
+    maps: Tensor = features.transpose(1, 2).unflatten(2, (side, side))
+    return maps
+
+
+def _parameters(layers: Mapping[int, nn.Module]) -> Sequence[nn.Parameter]:
+    return [p for layer in layers.values() for p in layer.parameters()]
+
+
+def _hidden(seen: CutPass) -> Mapping[int, Tensor]:
+    return {layer: x for layer, x in seen.outputs.items() if layer < LAYERS}
