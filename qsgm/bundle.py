@@ -18,6 +18,7 @@ from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_la
 from qsgm.defaults import MOST_LAYERS
 from qsgm.errors import QsgmError
 from qsgm.runtime import open_session
+from qsgm.tuning import short_run_factor
 
 MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
@@ -73,6 +74,12 @@ class Recipe:
 
     optimizer: OptimizerName
     rates: tuple[float, ...]  # one per tuned layer, first layer first
+    short_gain: float = 1.0  # what short runs multiply them with
+
+    def rates_over(self, steps: int) -> tuple[float, ...]:
+        """Where the rates of a run of so many steps start."""
+        factor = short_run_factor(self.short_gain, steps)
+        return tuple(factor * rate for rate in self.rates)
 
 
 @dataclass(frozen=True)
@@ -134,9 +141,9 @@ class Bundle:
         """
         recipes = self.manifest["recipes"][method]
         name: OptimizerName = optimizer or recipes["optimizer"]
-        return Recipe(
-            name, tuple(recipes["rates"][name][str(blocks or default_blocks(method, tuned))])
-        )
+        text = str(blocks or default_blocks(method, tuned))
+        gain = recipes["short_gains"][text] if method == "sgm" and name == "sgd" else 1.0
+        return Recipe(name, tuple(recipes["rates"][name][text]), gain)
 
     def session(self, name: str, threads: int = 1) -> ort.InferenceSession:
         """An ONNX Runtime session of one of the bundle's graphs."""
@@ -272,7 +279,8 @@ def _are_recipes(manifest: Mapping[str, Any]) -> bool:
                 return False
             if not all(0 < rate < math.inf for rate in rates):
                 return False
-    return True
+    gains = manifest["recipes"]["sgm"]["short_gains"]
+    return all(1 <= gains[text] < math.inf for text in can_tune["sgm"])
 
 
 # key: (what is expected, whether the manifest has it); in this order

@@ -126,6 +126,11 @@ class FinetuneResult:
     kept: Mapping[int, dict[str, Array]] = field(default_factory=dict)
 
     @property
+    def steps(self) -> int:
+        """How many there were."""
+        return self.settings.epochs * -(-TRAIN_CROPS // BATCH)
+
+    @property
     def zero_shot(self) -> Accuracy:
         """The same crops, by the untouched network."""
         return self.prepared.zero_shot
@@ -436,7 +441,8 @@ class _GuardedLoop(StepLoop):
         bundle, blocks = prepared.bundle, run_blocks(settings)
         name = step_file(settings.precision, recipe.optimizer, blocks)
         session = bundle.session(name, settings.threads)
-        rates = dict(zip(blocks.layers, recipe.rates, strict=True))
+        steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
+        rates = dict(zip(blocks.layers, recipe.rates_over(steps), strict=True))
         self.steps = 0
         self._bundle = bundle
         with running_graphs(bundle):

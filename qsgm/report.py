@@ -73,7 +73,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "peak_activation_bytes": result.peak_activation_bytes,
         "blocks": str(result.blocks),
         "optimizer": result.recipe.optimizer,
-        "rates": list(result.recipe.rates),
+        "rates": list(result.recipe.rates_over(result.steps)),
         "orientation_deg": angle(math.degrees(result.prepared.offset_rad), 2),
         "orientation_strength": number(result.prepared.offset_strength, 3),
         "warnings": list(result.warnings),

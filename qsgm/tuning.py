@@ -6,6 +6,7 @@ step, which ONNX Runtime does not promise to be safe.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from math import log
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ Array = NDArray[np.float32]
 Features = NDArray[np.float32] | NDArray[np.uint8]
 NEXT = "_next"
 BATCH = 32
+SHORT_RUN_STEPS, LONG_RUN_STEPS = 75, 500  # 3 and 20 epochs on the device
 
 
 class StepLoop:
@@ -88,6 +90,16 @@ def _buffers(arrays: Mapping[str, Array]) -> dict[str, ort.OrtValue]:
     return {
         name: ort.OrtValue.ortvalue_from_numpy(np.array(a, order="C")) for name, a in arrays.items()
     }
+
+
+def short_run_factor(gain: float, steps: int) -> float:
+    """What the rates of a run of this length are multiplied with.
+
+    `gain` for up to 75 steps, nothing from 500 on, and a power of the length between: a short run
+    has to take large steps, and is over before these could lead it astray.
+    """
+    shortness = log(LONG_RUN_STEPS / max(1, steps)) / log(LONG_RUN_STEPS / SHORT_RUN_STEPS)
+    return float(gain ** min(1.0, max(0.0, shortness)))
 
 
 def rate_factor(step: int, steps: int) -> float:

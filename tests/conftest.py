@@ -158,7 +158,11 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
         "most_layers": MOST_LAYERS,
         "blocks": [str(blocks) for blocks in BLOCKS],
         "recipes": {
-            "sgm": {"optimizer": "sgd", "rates": rates},
+            "sgm": {
+                "optimizer": "sgd",
+                "rates": rates,
+                "short_gains": {str(blocks): 1.0 for blocks in BLOCKS},
+            },
             "bp": {"optimizer": "adam", "rates": rates},
         },
         "initializers": {

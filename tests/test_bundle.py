@@ -192,6 +192,7 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("blocks",), [*BLOCKS, "4-5,6"], "'recipes' is damaged"),
         (("recipes",), {}, "'recipes' is damaged"),
         (("recipes", "bp"), [], "'recipes' is damaged"),
+        (("recipes", "sgm", "short_gains", "6"), 0.5, "'recipes' is damaged"),
         (("recipes", "sgm", "optimizer"), "lion", "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "sgd", "4,5,6"), [0.1], "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "adam", "6"), [0.0], "'recipes' is damaged"),
@@ -268,3 +269,19 @@ def test_one_layer_is_tuned_with_the_rates_of_the_method_asked_for(own_bundle: P
     found = load_bundle(own_bundle)
     assert found.recipe("sgm", 1, None) == Recipe("sgd", (0.123,))
     assert found.recipe("bp", 1, None).optimizer == "adam"
+
+
+def test_short_runs_of_sgms_start_at_higher_rates_and_those_of_others_do_not(
+    own_bundle: Path,
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["recipes"]["sgm"]["short_gains"]["5,6"] = 4.0
+    path.write_text(json.dumps(manifest))
+    found = load_bundle(own_bundle)
+    recipe = found.recipe("sgm", 2, None)
+    for steps, factor in ((25, 4), (75, 4), (194, 2), (500, 1), (5000, 1)):
+        expected = [factor * rate for rate in recipe.rates]
+        assert recipe.rates_over(steps) == pytest.approx(expected, rel=1e-2)
+    for other in (found.recipe("sgm", 2, "adam"), found.recipe("bp", 2, "sgd")):
+        assert other.rates_over(25) == other.rates

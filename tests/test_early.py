@@ -12,9 +12,11 @@ from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.local import outputs
 from qsgm.train.rates import (
     EARLY_RATE_GRID,
+    SHORT_GAINS,
     RatesConfig,
     choose_early,
     choose_late,
+    choose_short_gain,
     late_candidates,
 )
 from qsgm.train.sgm import Sgm
@@ -88,7 +90,12 @@ def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_their
     late, best = choose_late(rule, start[3:], behind(start[:3], pixels), config, scores.append)
     assert [len(late[tuned]) for tuned in (1, 2, 3)] == [1, 2, 3]
     assert len(scores) == len([*late_candidates(rule.rates)])
-    assert best.objective == min(score.objective for score in scores[-4:])
+    lowest = min(score.objective for score in scores[-4:])
+    assert lowest <= best.objective <= 1.01 * lowest
+    short = RatesConfig(short_epochs=1)
+    trial = UpdateRule(rule.sgms, FLAT, late[3], LOSS)
+    seen = behind(start[:3], pixels)
+    assert choose_short_gain(trial, start[3:], seen, short, scores.append) in SHORT_GAINS
     rule = UpdateRule(rule.sgms, FLAT, late[3], LOSS)
     early = choose_early(rule, start, pixels, config, scores.append)
     assert sorted(early) == [4, 5, 6]

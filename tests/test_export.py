@@ -117,7 +117,7 @@ def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:
         blocks = parse_blocks(text)
         tuned = len(blocks.layers)
         assert bundle.recipe("sgm", tuned, None, blocks) == Recipe("sgd", RATES[text])
-        assert bundle.recipe("sgm", tuned, "adam", blocks).rates == (3e-4,) * tuned
+        assert bundle.recipe("sgm", tuned, "adam", blocks).rates == (2e-3,) * tuned
     # Without rates of their own, blocks get those of as many layers on their own.
     assert bundle.recipe("sgm", 3, None, parse_blocks("4,5-6")).rates == RATES["4,5,6"]
     assert bundle.recipe("sgm", 3, None).rates == RATES["4,5,6"]

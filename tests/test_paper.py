@@ -264,6 +264,7 @@ def test_the_best_rate_has_the_lowest_mean_loss_of_those_that_diverge_nowhere() 
 
 def test_tables_show_averages_what_diverged_and_the_papers_figures() -> None:
     results = made_up_results()
+    results.scores["a"]["feedback alignment"]["SGD 0.1"] = (0.8, 0.9, 20.0)
     console = Console(width=80, record=True)
     console.print(report.render(results))
     text = console.export_text()
@@ -271,6 +272,8 @@ def test_tables_show_averages_what_diverged_and_the_papers_figures() -> None:
     assert ["SGM,", "3", "layers", "SGD", "0.1", *["–"] * 4] in rows
     assert ["SGD", "0.03", "10.0", "12.0", "11.0", "1.0"] in rows
     assert ["paper", "16.8", "8.6", "12.7", "2.9"] in rows
+    other = ["feedback", "alignment", "–", "1/2", "0.90", "11.0", "0.03"]
+    assert other in rows
     assert max(map(len, text.splitlines())) <= 80
     values = report.to_json(results)
     json.dumps(values, allow_nan=False)

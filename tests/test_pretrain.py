@@ -67,9 +67,10 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
     checkpoint = load_checkpoint(tmp_path / "sgm.pt")
     assert sorted(checkpoint.sgms) == [1, 2, 3, 4, 5]
     assert sorted(checkpoint.curvatures) == [4, 5, 6]
-    assert {b: len(rates) for b, rates in checkpoint.rates.items()} == {
-        str(single_layers(tuned)): tuned for tuned in range(1, 7)
-    }
+    singles = {str(single_layers(tuned)): tuned for tuned in range(1, 7)}
+    blocks = {"3-4,5,6": 4, "2-4,5,6": 5, "1-4,5,6": 6}
+    assert {b: len(rates) for b, rates in checkpoint.rates.items()} == singles | blocks
+    assert checkpoint.rates["3-4,5,6"][1:] == checkpoint.rates["4,5,6"]
     assert checkpoint.card["command"] == "qsgm pretrain -o sgm.pt --seed 3 --hidden 8"
     assert list(dict.fromkeys(stages)) == [
         "backbone",
@@ -230,7 +231,7 @@ def test_rates_that_all_diverge_leave_no_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rates_module, "RATE_GRID", (1e38,))
-    config = replace(TINY, trial_epochs=3)
+    config = replace(TINY, rates=replace(TINY.rates, epochs=3))
     with pytest.raises(QsgmError, match=r"trial runs .* diverged"):
         pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
     assert [path.name for path in tmp_path.iterdir()] == ["sgm.pt.partial"]
@@ -282,7 +283,7 @@ def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path
         after_interruption = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
-    assert threads == {"backbone": 2, "tasks": 1, "matching": 1, "meta": 1, "rates": 1}
+    assert threads == {"backbone": 2, "tasks": 1, "matching": 1, "meta": 1, "early": 1, "rates": 1}
     assert (after, after_interruption) == (2, 2)
 
 

@@ -99,6 +99,11 @@ def test_the_best_rates_are_those_with_the_lowest_finite_objective() -> None:
     assert best_rates({rates: Score(loss, 0.0, 0.0) for rates, loss in losses.items()}) == (3.0,)
 
 
+def test_of_rates_that_do_as_well_the_first_are_taken() -> None:
+    scores = {(1.0,): 2.05, (2.0,): 2.015, (3.0,): 2.0, (4.0,): 2.01}
+    assert best_rates({rates: Score(value, 0.0, 0.0) for rates, value in scores.items()}) == (2.0,)
+
+
 def test_recorded_examples_hold_true_gradients_and_an_sgm_learns_them() -> None:
     torch.manual_seed(0)
     net, loss = GraspNet().eval(), Loss()

@@ -54,6 +54,7 @@ class Checkpoint:
     loss: Loss
     rates: dict[str, tuple[float, ...]]  # of SGD, by blocks such as `4,5,6`; first layer first
     card: dict[str, Any]  # how it was made, and its figures; plain JSON
+    short_gain: float = 1.0  # what short runs of three layers and more multiply rates with
 
     def __post_init__(self) -> None:
         last = [*range(LAYERS - len(self.sgms), LAYERS)]
@@ -63,6 +64,8 @@ class Checkpoint:
         for tuned in range(1, self.most_layers + 1):
             if str(single_layers(tuned)) not in counts:
                 raise ValueError(f"there are no rates for layers {single_layers(tuned)}")
+        if self.short_gain < 1:
+            raise ValueError(f"short runs would have their rates lowered, times {self.short_gain}")
         for text, count in counts.items():
             layers = len(parse_blocks(text).layers)
             if count != layers or layers > self.most_layers:
@@ -88,6 +91,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "loss": asdict(checkpoint.loss),
         "rates": {blocks: list(rates) for blocks, rates in checkpoint.rates.items()},
         "card": json.dumps(checkpoint.card),
+        "short_gain": checkpoint.short_gain,
     }
     buffer = BytesIO()
     torch.save(data, buffer)
@@ -110,7 +114,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         curvatures = {layer: _curvature(layer, data) for layer in data["curvatures"]}
         loss, rates = _loss(data["loss"]), _rates(data["rates"])
         card = dict(json.loads(data["card"]))
-        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card)
+        gain = _number(data["short_gain"])
+        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card, gain)
     except _UNFIT as error:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"

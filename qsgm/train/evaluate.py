@@ -103,7 +103,10 @@ def _angle_error_deg(seen: Tensor, labels: Tensor, encoding: AngleEncoding) -> T
 
 
 def best_rates(scores: Mapping[tuple[float, ...], Score]) -> tuple[float, ...]:
-    """The rates whose run ended with the lowest finite objective.
+    """The first rates whose objective is finite and within a hundredth of the lowest.
+
+    Of rates that do about as well the lower ones, listed first, are further from those at which
+    some other object's run blows up.
 
     Raises:
         QsgmError: there is none.
@@ -115,4 +118,5 @@ def best_rates(scores: Mapping[tuple[float, ...], Score]) -> tuple[float, ...]:
             f"pretraining failed: all {len(scores)} trial runs with the new SGMs diverged;"
             " pass another --seed, or lower the rates in PretrainConfig"
         )
-    return min(finite, key=lambda rates: finite[rates])
+    bound = 1.01 * min(finite.values())
+    return next(rates for rates, value in finite.items() if value <= bound)

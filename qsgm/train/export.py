@@ -65,7 +65,9 @@ LARGEST_FOLD_ERROR = 1e-4  # relative to the largest output
 FOLD_CROPS = 64
 # SGD's rates for the SGMs are meta-trained; these are the usual ones, for every layer.
 BACKPROP_RATES = {"sgd": 1e-2, "adam": 1e-3}
-SGM_ADAM_RATE = 3e-4
+SGM_ADAM_RATE = 2e-3
+# As many as were meta-trained together, and for which the gain of short runs was found.
+MAML_LAYERS = 3
 
 
 def fold_and_quantize(
@@ -252,7 +254,13 @@ def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[str, Any]:
         name: {str(one): [rate] * len(one.layers) for one in whole}
         for name, rate in BACKPROP_RATES.items()
     }
-    return {"sgm": {"optimizer": "sgd", "rates": sgm}, "bp": {"optimizer": "adam", "rates": bp}}
+    gains = {
+        str(one): checkpoint.short_gain if len(one.layers) >= MAML_LAYERS else 1.0 for one in blocks
+    }
+    return {
+        "sgm": {"optimizer": "sgd", "rates": sgm, "short_gains": gains},
+        "bp": {"optimizer": "adam", "rates": bp},
+    }
 
 
 def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:

@@ -37,9 +37,12 @@ from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
 from qsgm.train.partial import Partial
 from qsgm.train.rates import (
     EARLY_RATE_GRID,
+    SHORT_GAINS,
     RatesConfig,
+    block_rates,
     choose_early,
     choose_late,
+    choose_short_gain,
     late_candidates,
 )
 from qsgm.train.sgm import Sgm
@@ -101,10 +104,10 @@ def pretrain(
         rule = _learn_to_tune(partial, net, config, loss, seed, watch)
         early = _match_early(partial, net, rule, config, seed, watch)
         rule = replace(rule, sgms={**early, **rule.sgms})
-        rates, score = _choose_rates(net, rule, config, seed, watch)
+        rates, gain, score = _choose_rates(net, rule, config, seed, watch)
     command = _command(seed, device, config, loss)
     card = _card(command, device, config, score, partial)
-    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card)
+    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card, gain)
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
     partial.remove()
@@ -288,25 +291,29 @@ def _match_early(
 
 def _choose_rates(
     net: GraspNet, rule: UpdateRule, config: PretrainConfig, seed: int, watch: Watch
-) -> tuple[dict[str, tuple[float, ...]], Score]:
-    """The best rates for every number of tuned layers, and the score of three."""
+) -> tuple[dict[str, tuple[float, ...]], float, Score]:
+    """Rates for all numbers of layers and blocks, short runs' gain, and the score of three."""
     sizes = config.rates
     tasks = _draw(net, sizes.tasks, sizes.crops_per_task, seed + 2, rule.loss, watch)
     done = 0
-    total = len([*late_candidates(rule.rates)]) + (LAYERS - TUNED) * len(EARLY_RATE_GRID)
+    total = len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
+    total += (LAYERS - TUNED) * len(EARLY_RATE_GRID)
 
     def after_run(score: Score) -> None:
         nonlocal done
         done += 1
         watch("rates", done, total, {"angle": score.angle_mae_deg})
 
-    rates, score = choose_late(rule, folded_start(net, TUNED), tasks, sizes, after_run)
+    start = folded_start(net, TUNED)
+    rates, score = choose_late(rule, start, tasks, sizes, after_run)
     pixels = _draw(
         net, sizes.early_tasks, sizes.early_crops_per_task, seed + 6, rule.loss, watch, 0
     )
     rule = replace(rule, rates=rates[TUNED])
+    gain = choose_short_gain(rule, start, tasks, sizes, after_run)
     rates |= choose_early(rule, folded_start(net, LAYERS), pixels, sizes, after_run)
-    return {str(single_layers(tuned)): of_layers for tuned, of_layers in rates.items()}, score
+    singles = {str(single_layers(tuned)): of_layers for tuned, of_layers in rates.items()}
+    return singles | block_rates(rates[TUNED]), gain, score
 
 
 def _check_device(device: str) -> None:

@@ -33,6 +33,7 @@ from qsgm.train.graspnet import LAYERS
 from qsgm.train.sgm import Sgm
 from qsgm.train.start import folded_start
 from qsgm.train.tasks import CENTER_PX, TaskSet, make_task, start_states
+from qsgm.tuning import BATCH, short_run_factor
 
 GRID: Mapping[str, tuple[MakeOptimizer, tuple[float, ...]]] = {
     "sgd": (sgd, (0.003, 0.01, 0.03)),
@@ -169,7 +170,8 @@ def _recipes(tuned: int, epochs: int) -> Iterator[tuple[str, Recipe]]:
 
 def _as_shipped(checkpoint: Checkpoint, tasks: TaskSet, tuned: int, epochs: int) -> Tensor:
     """The checkpoint's rule with all it has learnt: (T, 3)."""
-    rates = checkpoint.rates[str(single_layers(tuned))]
+    factor = short_run_factor(checkpoint.short_gain, epochs * -(-TRAIN_CROPS // BATCH))
+    rates = tuple(factor * rate for rate in checkpoint.rates[str(single_layers(tuned))])
     rule = UpdateRule(checkpoint.sgms, checkpoint.curvatures, rates, checkpoint.loss)
     start, scores = folded_start(checkpoint.net, tuned), []
     for some in tasks.chunks(CHUNK):

@@ -90,7 +90,7 @@ _LEGEND = (
     "SGD 0.1: the paper's rate, constant; below it, or `best`: the rate of those tried with the "
     "lowest mean objective on the same crops; both on folded weights, as on the device. BN: "
     "batchnorm kept and on batch statistics while tuning, as in the paper. –: diverged on this "
-    "object, or on any."
+    "object, or on any; – 2/6: on all but 2 of 6."
 )
 
 
@@ -152,12 +152,16 @@ def _others_table(results: PaperResults) -> Table:
 
 
 def _averages(results: PaperResults, system: str, variant: str) -> list[str]:
-    """Detection and angle error, averaged over the objects."""
+    """Detection and angle error, averaged; or on how many objects the run did not diverge."""
     cells = []
     for metric in METRICS:
         values = values_of(results, system, variant, metric)
-        form = _FORMS[metric].format
-        cells += [NOT_RUN] if values is None else _cells([_statistics(values)[0]], form)
+        if values is None:
+            return [NOT_RUN, NOT_RUN]
+        sound = int(np.isfinite(values).sum())
+        if sound < len(values):
+            return [DIVERGED, f"{sound}/{len(values)}"]
+        cells.append(_FORMS[metric].format(_statistics(values)[0]))
     return cells
 
 

@@ -27,7 +27,7 @@ from qsgm.train.tasks import TaskSet, features_of
 ADAM = "Adam 0.001"
 BATCHNORM = "BN, SGD 0.1"
 # Of SGD with momentum, constant; the paper's first.
-RATES = (1e-1, 3e-2, 1e-2, 3e-3)
+RATES = (1e-1, 1e-2, 3e-3, 1e-3)
 
 
 @dataclass(frozen=True)
