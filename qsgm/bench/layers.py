@@ -18,8 +18,8 @@ from qsgm.finetuning import Settings, Watch, peak_activation_bytes, prepare, tra
 from qsgm.report import number, plain_table
 
 Floats = NDArray[np.float64]
-LEGEND = """means over frames; angle: error in degrees, modulo 180°; better: share of the frames on
-which the angle error is lower than with the first blocks; tuning: median seconds"""
+LEGEND = """means over frames; angle: error in degrees, modulo 180°; better: share of the
+frames with a lower angle error than by the first blocks; tuning: median"""
 
 
 @dataclass(frozen=True)
