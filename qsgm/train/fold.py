@@ -10,20 +10,18 @@ statistics with a positive variance. After: convolutions, biases, ReLU and pooli
 """
 
 import copy
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qsgm.errors import QsgmError
+from qsgm.folded import FloatArray, FoldedConv, FoldedSgm
 from qsgm.train.graspnet import POOL, GraspNet, Layer, normalize
 from qsgm.train.sgm import Sgm
-
-FloatArray = NDArray[np.float32]
 
 PIXEL_SCALE = 1 / 127.5
 PIXEL_OFFSET = -1.0
@@ -45,27 +43,9 @@ class FoldedNet:
     """The six layers; the first takes BGR pixels in [-1, 1], see :func:`on_pixels`."""
 
     layers: tuple[FoldedLayer, ...]
-
-
-@dataclass(frozen=True)
-class FoldedConv:
-    """A convolution of an SGM, padded to keep the size."""
-
-    weight: FloatArray  # (O, I, k, k)
-    bias: FloatArray  # (O,)
-
-
-@dataclass(frozen=True)
-class FoldedSgm:
-    """The SGM behind layer `layer`: convolutions with ReLU between."""
-
-    layer: int
-    convs: tuple[FoldedConv, ...]
-
-    @property
-    def kernel(self) -> int:
-        """Side of all its windows: 3 behind layers 1 to 3, where maps are, else 1."""
-        return int(self.convs[0].weight.shape[2])
+    # By layer, (Co,): what one step of each channel stands for where its output is kept in u8, see
+    # :mod:`qsgm.train.quantize_trunk`. Features of a layer that is not here are float32.
+    feature_steps: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 def fold_net(net: GraspNet) -> FoldedNet:
@@ -98,7 +78,7 @@ def on_pixels(net: FoldedNet) -> FoldedNet:
         weight=(weight * PIXEL_SCALE).astype(np.float32),
         bias=bias.astype(np.float32),
     )
-    return FoldedNet((absorbed, *net.layers[1:]))
+    return replace(net, layers=(absorbed, *net.layers[1:]))
 
 
 def fold_sgm(sgm: Sgm) -> FoldedSgm:

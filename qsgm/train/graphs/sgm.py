@@ -7,12 +7,18 @@ ONNX Runtime has no integer Conv with a float result, so int8 cuts windows for a
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from qsgm.train.fold import FloatArray, FoldedSgm
+from qsgm.folded import FoldedSgm
+from qsgm.quantize import (
+    UNDERFLOW_STEPS,
+    Codes,
+    QuantizedProduct,
+    QuantizedSgm,
+    clipping_bounds,
+    constants,
+)
 from qsgm.train.graphs.build import Ops, Value
 from qsgm.train.graphs.layers import Batch, gather_windows
-from qsgm.train.quantize import CLIP_TOLERANCE_STEPS, U8_MAX, QuantizedProduct, QuantizedSgm
 
 
 def sgm_gradient(
@@ -53,14 +59,21 @@ def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
     ReLU costs no node: rounding to u8 clips at zero. Padding is real zeros in front of the first
     product, where they have a code of their own, and the code 0 in front of the others.
     """
+    declare_constants(op, sgm)
     x = op.Reshape(seen, op.shape(-1, len(sgm.input_low)))
-    x = as_u8(op, scaled_inputs(op, sgm, padded(op, x, side, sgm.kernel, len(sgm.input_low))))
-    for product in sgm.products[:-1]:
-        hidden = as_u8(op, int8_product(op, product, u8_windows(op, x, side, sgm.kernel, product)))
-        x = padded(op, hidden, side, sgm.kernel, len(product.bias))
-    last = sgm.products[-1]
-    gradient = int8_product(op, last, u8_windows(op, x, side, sgm.kernel, last))
-    return op.Reshape(gradient, op.shape(-1, side**2, len(last.bias)))
+    x = scaled_inputs(op, sgm, padded(op, x, side, sgm.kernel, len(sgm.input_low)))
+    planes = as_planes(op, sgm.codes, x)
+    for i, product in enumerate(sgm.products):
+        if i > 0:
+            planes = framed_planes(op, sgm, side, x, len(sgm.products[i - 1].bias))
+        width = product.coarse.shape[1]
+        widths = width, width * sgm.bits // 8
+        high, both = (
+            u8_windows(op, u8, side, sgm.kernel, width)
+            for u8, width in zip(planes, widths, strict=True)
+        )
+        x = int8_product(op, f"sgm{sgm.layer}/{i}", product, high, both)
+    return op.Reshape(x, op.shape(-1, side**2, len(sgm.products[-1].bias)))
 
 
 def padded(op: Ops, x: Value, side: int, kernel: int, channels: int) -> Value:
@@ -76,51 +89,90 @@ def padded(op: Ops, x: Value, side: int, kernel: int, channels: int) -> Value:
     return op.Reshape(framed, op.shape(-1, (side + 2 * pad) ** 2, channels))
 
 
+def declare_constants(op: Ops, sgm: QuantizedSgm) -> None:
+    """Everything that depends on ranges, under its own name: another calibration exchanges it."""
+    for name, array in constants(sgm).items():
+        op.graph.initializer(name, array)
+
+
 def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
-    """Inputs (..., Ci) with each channel's calibrated range spread over 0..255, not rounded yet."""
-    return op.Mul(op.Sub(seen, op.constant(sgm.input_low)), op.constant(sgm.input_gain))
+    """Inputs (..., Ci) as shifted codes, neither rounded nor clipped yet."""
+    low, gain = f"sgm{sgm.layer}/low", f"sgm{sgm.layer}/gain"
+    return op.Mul(op.Sub(seen, low), gain)
 
 
-def as_u8(op: Ops, x: Value) -> Value:
-    """Round to u8 with scale 1 and zero point 0."""
-    return op.QuantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
+def as_planes(op: Ops, codes: Codes, x: Value) -> tuple[Value, Value]:
+    """Shifted codes (..., C) to their high plane u8 (..., C), and to all planes side by side."""
+    nothing = op.constant(0, np.uint8)
+    if codes.high_step == 1:
+        high = op.QuantizeLinear(x, op.constant(1.0), nothing)
+        return high, high
+    step = op.constant(float(codes.high_step))
+    high = op.QuantizeLinear(x, step, nothing)
+    remainder = op.Sub(x, op.DequantizeLinear(high, step, nothing))
+    low = op.QuantizeLinear(remainder, op.constant(1.0), op.constant(codes.shift, np.uint8))
+    return high, op.Concat(high, low, axis=-1)
 
 
-def u8_windows(op: Ops, x: Value, side: int, kernel: int, product: QuantizedProduct) -> Value:
-    """Windows (B * P, K) of :func:`padded` u8 maps, as what the runtime turns into integers."""
+def framed_planes(
+    op: Ops, sgm: QuantizedSgm, side: int, hidden: Value, channels: int
+) -> tuple[Value, Value]:
+    """The planes of hidden maps (B * P, C), with the code 0 around them where they are maps."""
+    high, both = as_planes(op, sgm.codes, hidden)
+    return (
+        padded(op, high, side, sgm.kernel, channels),
+        padded(op, both, side, sgm.kernel, channels * sgm.bits // 8),
+    )
+
+
+def u8_windows(op: Ops, x: Value, side: int, kernel: int, width: int) -> Value:
+    """Windows (B * P, width) of :func:`padded` u8 maps, as what the runtime turns into integers."""
     if kernel > 1:
         windows = gather_windows(op, x, side + 2 * (kernel // 2), kernel, stride=1)
-        x = op.Reshape(windows, op.shape(-1, product.weight.shape[1]))
+        x = op.Reshape(windows, op.shape(-1, width))
     return op.DequantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
 
 
-def int8_product(op: Ops, product: QuantizedProduct, x: Value) -> Value:
-    """Windows (B * P, I) to (B * P, O), both planes added as float.
+def int8_product(op: Ops, name: str, product: QuantizedProduct, high: Value, both: Value) -> Value:
+    """Windows of the high plane and of all planes to (B * P, O).
 
-    The bias has the coarse plane's scale, exactly: the input's scale is 1.
+    `name` is what the product's constants begin with. The bias has the scale of what it is added
+    to, exactly: that input's scale is 1.
     """
-    bias, scale = op.constant(product.bias, np.int32), op.constant(product.scale)
-    bias = op.DequantizeLinear(bias, scale, axis=0)
-    coarse = op.Gemm(x, s8_plane(op, product.weight, product.scale), bias, transB=1)
-    fine = op.Gemm(x, s8_plane(op, product.fine, product.fine_scale), transB=1)
-    return op.Add(coarse, fine)
+    bias = op.DequantizeLinear(f"{name}/bias", f"{name}/scale", axis=0)
+    coarse = op.Gemm(high, s8_weight(op, name, "coarse", "coarse_scale", product), transB=1)
+    rest = op.Gemm(both, s8_weight(op, name, "rest", "scale", product), bias, transB=1)
+    return op.Add(coarse, rest)
 
 
-def s8_plane(op: Ops, plane: NDArray[np.int8], scale: FloatArray) -> Value:
-    """Weights (O, I) with a scale per row, as the runtime wants to see them.
+def s8_weight(op: Ops, name: str, weight: str, scale: str, product: QuantizedProduct) -> Value:
+    """Weights with a scale per row, as the runtime wants to see them.
 
-    Weights and zero points are not shared between planes, equal or not: where the runtime makes
-    them u8 (see :mod:`qsgm.runtime`) it refuses to convert the same constant twice.
+    Neither weights nor zero points are shared, equal or not: where the runtime makes them u8 (see
+    :mod:`qsgm.runtime`) it refuses to convert the same constant twice.
     """
-    name = f"{op.scope}/s8_plane_{len(op.graph.constants)}"
-    weight = op.graph.initializer(name, plane)
-    no_offset = op.graph.initializer(f"{name}_zero_point", np.zeros_like(plane[:, 0]))
-    return op.DequantizeLinear(weight, op.constant(scale), no_offset, axis=0)
+    no_offset = np.zeros(len(product.bias), np.int8)
+    zero_point = op.graph.initializer(f"{name}/{weight}_zero_point", no_offset)
+    return op.DequantizeLinear(f"{name}/{weight}", f"{name}/{scale}", zero_point, axis=0)
 
 
-def clipped_fraction(op: Ops, scaled: Value) -> Value:
-    """Share of scaled inputs further outside 0..255 than rounding explains; a scalar."""
-    middle, reach = U8_MAX / 2, U8_MAX / 2 + CLIP_TOLERANCE_STEPS
+def clipped_fraction(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:
+    """Share of scaled inputs further outside their codes than rounding explains; a scalar."""
+    middle, reach = clipping_bounds(sgm.codes)
     outside = op.Greater(op.Abs(op.Sub(scaled, op.constant(middle))), op.constant(reach))
-    ones = op.Where(outside, op.constant(1.0), op.constant(0.0))
-    return op.ReduceMean(ones, keepdims=0)
+    return op.ReduceMean(as_float(op, outside), keepdims=0)
+
+
+def underflow_fraction(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
+    """Of the inputs other than 0, the share that is rounded to 0; a scalar."""
+    size, nothing = op.Abs(seen), op.constant(0.0)
+    there = op.Greater(size, nothing)
+    below = op.Less(op.Mul(size, f"sgm{sgm.layer}/gain"), op.constant(UNDERFLOW_STEPS))
+    lost = op.ReduceSum(as_float(op, op.And(there, below)), keepdims=0)
+    count = op.ReduceSum(as_float(op, there), keepdims=0)
+    return op.Div(lost, op.Max(count, op.constant(1.0)))
+
+
+def as_float(op: Ops, flag: Value) -> Value:
+    """1 where a flag is set, else 0."""
+    return op.Where(flag, op.constant(1.0), op.constant(0.0))
