@@ -14,26 +14,31 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from qsgm.angles import ENCODINGS, AngleEncoding
-from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
+from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.defaults import MOST_LAYERS
 from qsgm.errors import QsgmError
+from qsgm.folded import FoldedConv, FoldedSgm
+from qsgm.quantize import ACTIVATION_BITS, ActivationBits
 from qsgm.runtime import open_session
 from qsgm.tuning import short_run_factor
 
 MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
-VERSION = 2
+VERSION = 3
 NETWORK = "network.onnx"
+WEIGHTS = "weights.bin"
 FLOAT_BYTES = 4
 COMMAND = "qsgm fold-and-quantize"
 MANIFEST_KEYS: dict[str, type] = {
     "encoding": str,
     "label_smoothing": float,
     "most_layers": int,
+    "trunk": str,
     "blocks": list,
     "files": dict,
     "initializers": dict,
     "recipes": dict,
+    "sgms": dict,
 }
 
 Method = Literal["sgm", "bp"]
@@ -43,9 +48,9 @@ OptimizerName = Literal["sgd", "adam"]
 OPTIMIZERS: tuple[OptimizerName, ...] = get_args(OptimizerName)
 
 
-def trunk_file(tuned: int) -> str:
-    """Name of the graph of the frozen layers when the last `tuned` layers are tuned."""
-    return f"trunk_{tuned}.onnx"
+def trunk_file(precision: Precision, tuned: int) -> str:
+    """Name of the graph of the frozen layers when the last `tuned` are tuned; float if none are."""
+    return f"trunk_{precision if tuned < LAYERS else 'float'}_{tuned}.onnx"
 
 
 def head_file(tuned: int) -> str:
@@ -106,6 +111,12 @@ class Bundle:
         return int(self.manifest["most_layers"])
 
     @property
+    def trunk(self) -> Precision:
+        """The frozen layers' precision unless the user says otherwise."""
+        precision: Precision = self.manifest["trunk"]
+        return precision
+
+    @property
     def blocks(self) -> tuple[str, ...]:
         """What it can tune with SGMs, such as `1-4,5,6`."""
         return tuple(self.manifest["blocks"])
@@ -145,9 +156,31 @@ class Bundle:
         gain = recipes["short_gains"][text] if method == "sgm" and name == "sgd" else 1.0
         return Recipe(name, tuple(recipes["rates"][name][text]), gain)
 
-    def session(self, name: str, threads: int = 1) -> ort.InferenceSession:
-        """An ONNX Runtime session of one of the bundle's graphs."""
-        return open_session(self.folder / name, threads)
+    def session(
+        self, name: str, threads: int = 1, constants: Mapping[str, NDArray[Any]] | None = None
+    ) -> ort.InferenceSession:
+        """An ONNX Runtime session of one of the bundle's graphs.
+
+        `constants` take the place of the graph's own, by initializer name.
+        """
+        return open_session(self.folder / name, threads, constants or {})
+
+    def activation_bits(self, layer: int) -> ActivationBits:
+        """Of the int8 SGM behind a layer."""
+        bits: ActivationBits = self.manifest["sgms"][str(layer)]["bits"]
+        return bits
+
+    def float_sgm(self, layer: int) -> FoldedSgm:
+        """The SGM behind a layer before it was quantized."""
+        data = (self.folder / WEIGHTS).read_bytes()
+        convolutions = self.manifest["sgms"][str(layer)]["convolutions"]
+        return FoldedSgm(
+            layer,
+            tuple(
+                FoldedConv(_array_at(data, conv["weight"]), _array_at(data, conv["bias"]))
+                for conv in convolutions
+            ),
+        )
 
     def start_weights(self, tuned: int) -> dict[str, NDArray[np.float32]]:
         """The tuned layers' starting weights (Co, Ci, kh, kw) and biases (Co,), by name."""
@@ -167,10 +200,14 @@ class Bundle:
         return bytes(data)
 
     def _initializer(self, data: bytes, name: str) -> NDArray[np.float32]:
-        place = self.manifest["initializers"][name]
-        count = int(np.prod(place["shape"]))
-        values = np.frombuffer(data, dtype="<f4", count=count, offset=place["offset"])
-        return values.reshape(place["shape"]).astype(np.float32)
+        return _array_at(data, self.manifest["initializers"][name])
+
+
+def _array_at(data: bytes, place: Mapping[str, Any]) -> NDArray[np.float32]:
+    """Float32 numbers in a file, at an offset and of a shape."""
+    count = int(np.prod(place["shape"]))
+    values = np.frombuffer(data, dtype="<f4", count=count, offset=place["offset"])
+    return values.reshape(place["shape"]).astype(np.float32)
 
 
 def load_bundle(folder: Path) -> Bundle:
@@ -198,9 +235,9 @@ def load_bundle(folder: Path) -> Bundle:
 
 def needed_files(most_layers: int, blocks: Sequence[str]) -> set[str]:
     """The graphs without which a bundle cannot do what its layers and blocks promise."""
-    needed = {NETWORK}
+    needed = {NETWORK, WEIGHTS}
     for tuned in range(1, most_layers + 1):
-        needed |= {trunk_file(tuned), head_file(tuned)}
+        needed |= {head_file(tuned), *(trunk_file(name, tuned) for name in PRECISIONS)}
     steps = [*map(parse_blocks, blocks), *map(one_block, range(1, most_layers + 1))]
     for precision, optimizer, one in product(PRECISIONS, OPTIMIZERS, steps):
         needed.add(step_file(precision, optimizer, one))
@@ -226,12 +263,12 @@ def _check_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     if missing:
         raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
     _check_places(path, manifest["initializers"], manifest["most_layers"])
+    _check_sgms(path, manifest["sgms"], manifest["most_layers"])
 
 
 def _check_places(path: Path, places: Mapping[str, Any], most_layers: int) -> None:
     """Refuse weights and biases that do not lie inside the network's file."""
-    network = path.with_name(NETWORK)
-    size = network.stat().st_size if network.is_file() else math.inf  # missing: refused later
+    size = _size(path.with_name(NETWORK))
     for layer in tuned_layers(most_layers):
         for name, sides in ((f"weight{layer}", 4), (f"bias{layer}", 1)):
             if not _is_place(places.get(name), sides, size):
@@ -239,6 +276,32 @@ def _check_places(path: Path, places: Mapping[str, Any], most_layers: int) -> No
                     f"{path}: 'initializers' gives {str(places.get(name))[:80]} for {name}, "
                     f"expected an offset and {sides} sides inside {NETWORK}; run `{COMMAND}` again"
                 )
+
+
+def _check_sgms(path: Path, sgms: Mapping[str, Any], most_layers: int) -> None:
+    """Refuse SGMs that are none, or whose weights do not lie inside their file."""
+    size = _size(path.with_name(WEIGHTS))
+    for layer in tuned_layers(most_layers)[:-1]:
+        try:
+            bits, convolutions = sgms[str(layer)]["bits"], sgms[str(layer)]["convolutions"]
+            sane = bits in ACTIVATION_BITS and len(convolutions) > 1
+            sane = sane and all(
+                _is_place(conv[name], sides, size)
+                for conv in convolutions
+                for name, sides in (("weight", 4), ("bias", 1))
+            )
+        except (KeyError, TypeError):
+            sane = False
+        if not sane:
+            raise QsgmError(
+                f"{path}: 'sgms' gives {str(sgms.get(str(layer)))[:80]} for layer {layer}, expected"
+                f" bits and convolutions inside {WEIGHTS}; run `{COMMAND}` again"
+            )
+
+
+def _size(path: Path) -> float:
+    """Of a file in bytes; without end for one that is missing: it is refused later."""
+    return path.stat().st_size if path.is_file() else math.inf
 
 
 def _is_place(place: Any, sides: int, size: float) -> bool:
@@ -288,6 +351,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Mapping[str, Any]], bool]]] = {
     "encoding": (" or ".join(ENCODINGS), lambda found: found["encoding"] in ENCODINGS),
     "label_smoothing": ("0 to below 1", lambda found: 0 <= found["label_smoothing"] < 1),
     "most_layers": (f"1 to {MOST_LAYERS}", lambda found: 1 <= found["most_layers"] <= MOST_LAYERS),
+    "trunk": (" or ".join(PRECISIONS), lambda found: found["trunk"] in PRECISIONS),
     "blocks": ("texts such as 5,6 and 4,5-6, each once, for every number of layers", _are_blocks),
     "recipes": ("positive rates, one per tuned layer, for every method", _are_recipes),
 }

@@ -1,10 +1,13 @@
 """Stock ONNX Runtime sessions with this project's settings."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import onnxruntime as ort
+from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_native
 
 from qsgm.errors import QsgmError
@@ -18,6 +21,7 @@ _CONFIG = {
     # (ONNX Runtime makes the s8 weights u8) the same bits.
     "session.x64quantprecision": "1",
 }
+_NONE: Mapping[str, NDArray[Any]] = MappingProxyType({})
 # What a graph raises when it runs: ONNX Runtime's own types have no common one, and its Python
 # side raises ValueError (an input is missing) and RuntimeError (a name is unknown).
 _RUN_ERRORS: tuple[type[Exception], ...] = (
@@ -42,8 +46,15 @@ def session_options(threads: int = 1) -> ort.SessionOptions:
     return options
 
 
-def open_session(model: Path | bytes, threads: int = 1) -> ort.InferenceSession:
+def open_session(
+    model: Path | bytes, threads: int = 1, constants: Mapping[str, NDArray[Any]] = _NONE
+) -> ort.InferenceSession:
     """A CPU session of an ONNX file or of its bytes.
+
+    Args:
+        model: whose external data, if it has any, lies beside its file.
+        threads: for each operator.
+        constants: in the place of the model's own external ones, by initializer name.
 
     Raises:
         QsgmError: ONNX Runtime does not accept the model.
@@ -51,7 +62,13 @@ def open_session(model: Path | bytes, threads: int = 1) -> ort.InferenceSession:
     source = model if isinstance(model, bytes) else str(model)
     try:
         options = session_options(threads)
-        return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        # Not add_initializer: that one comes after the optimizer has made constants of constants.
+        values = [ort.OrtValue.ortvalue_from_numpy(array) for array in constants.values()]
+        options.add_external_initializers([*constants], values)
+        session = ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        # The session may read their memory as long as it lives.
+        session.constants = constants, values
+        return session
     except Exception as error:  # ORT raises several unrelated types
         name = "a graph" if isinstance(model, bytes) else f"{model}"
         raise QsgmError(

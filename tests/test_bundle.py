@@ -93,8 +93,8 @@ def refusal(folder: Path) -> str:
 
 
 def test_a_missing_graph_is_named(own_bundle: Path) -> None:
-    (own_bundle / trunk_file(2)).unlink()
-    assert "lacks trunk_2.onnx; export it again" in refusal(own_bundle)
+    (own_bundle / trunk_file("float", 2)).unlink()
+    assert "lacks trunk_float_2.onnx; export it again" in refusal(own_bundle)
 
 
 def test_a_graph_altered_by_one_bit_is_named(own_bundle: Path) -> None:
@@ -130,16 +130,16 @@ def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
 def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> None:
     path = own_bundle / "manifest.json"
     manifest = json.loads(path.read_text())
-    (own_bundle / trunk_file(3)).write_bytes(b"not a graph")
+    (own_bundle / trunk_file("float", 3)).write_bytes(b"not a graph")
     sha256 = hashlib.sha256(b"not a graph").hexdigest()
-    manifest["files"][trunk_file(3)] = {"sha256": sha256}
+    manifest["files"][trunk_file("float", 3)] = {"sha256": sha256}
     path.write_text(json.dumps(manifest))
-    with pytest.raises(QsgmError, match=r"cannot load .*trunk_3\.onnx"):
-        load_bundle(own_bundle).session(trunk_file(3))
+    with pytest.raises(QsgmError, match=r"cannot load .*trunk_float_3\.onnx"):
+        load_bundle(own_bundle).session(trunk_file("float", 3))
 
 
 @pytest.mark.parametrize(
-    "key", ["encoding", "blocks", "files", "initializers", "recipes", "most_layers"]
+    "key", ["encoding", "trunk", "blocks", "files", "initializers", "recipes", "most_layers"]
 )
 def test_a_manifest_without_one_of_its_keys_is_refused_by_that_key(
     own_bundle: Path, key: str
@@ -181,6 +181,7 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("label_smoothing",), float("nan"), "'label_smoothing' is damaged"),
         (("most_layers",), 0, "'most_layers' is damaged: expected 1 to 6"),
         (("most_layers",), 7, "'most_layers' is damaged"),
+        (("trunk",), "int4", "'trunk' is damaged: expected int8 or float"),
         (("blocks",), [], "'blocks' is damaged"),
         (("blocks",), [*BLOCKS, "4,5,6"], "'blocks' is damaged"),
         (("blocks",), [*BLOCKS, "4,5"], "'blocks' is damaged"),
@@ -221,7 +222,8 @@ def test_a_manifest_that_says_nonsense_is_refused_by_its_key(
     [
         NETWORK,
         head_file(1),
-        trunk_file(6),
+        trunk_file("float", 6),
+        trunk_file("int8", 3),
         step_file("float", "adam", single_layers(2)),
         step_file("int8", "sgd", parse_blocks("1-4,5,6")),
         step_file("float", "sgd", one_block(5)),
@@ -240,11 +242,11 @@ def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
 @pytest.mark.parametrize(
     ("name", "other"),
     [
-        (trunk_file(3), trunk_file(1)),
-        (trunk_file(3), head_file(3)),
+        (trunk_file("float", 3), trunk_file("float", 1)),
+        (trunk_file("float", 3), head_file(3)),
         (head_file(3), head_file(1)),
         (STEP, step_file("int8", "sgd", single_layers(2))),
-        (STEP, trunk_file(3)),
+        (STEP, trunk_file("float", 3)),
         (probe_file(3), head_file(3)),
     ],
 )
@@ -256,7 +258,9 @@ def test_another_graph_under_the_name_of_one_is_refused_when_it_runs(
     (own_bundle / name).write_bytes((own_bundle / other).read_bytes())
     manifest["files"][name] = manifest["files"][other]
     path.write_text(json.dumps(manifest))
-    with pytest.raises(QsgmError, match=r"does not fit .*; export it again with") as raised:
+    with pytest.raises(
+        QsgmError, match=r"(does not fit|has no output) .*export it again with"
+    ) as raised:
         finetune(frame, load_bundle(own_bundle), Settings(epochs=1))
     assert "\n" not in str(raised.value)
 

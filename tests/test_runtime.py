@@ -12,7 +12,7 @@ from qsgm.train.graphs.inspection import integer_operators
 
 
 def test_products_of_u8_and_s8_are_exact_on_cpus_without_vnni(bundle: Bundle) -> None:
-    options = bundle.session(trunk_file(3)).get_session_options()
+    options = bundle.session(trunk_file("float", 3)).get_session_options()
     assert options.get_session_config_entry("session.x64quantprecision") == "1"
 
 
@@ -39,7 +39,7 @@ def test_what_is_no_graph_is_refused_in_one_line() -> None:
 def test_a_graph_that_does_not_fit_its_inputs_is_refused_in_one_line(
     bundle: Bundle, feeds: dict[str, np.ndarray]
 ) -> None:
-    session = bundle.session(trunk_file(3))
+    session = bundle.session(trunk_file("float", 3))
     refused = pytest.raises(QsgmError, match=r"a graph of it does not fit .*; mend it")
     with refused as raised, running("it", "mend it"):
         session.run(None, feeds)

@@ -1,0 +1,147 @@
+"""Other ranges for int8 SGMs, exchanged in a session: the graph is left as it was exported."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from qsgm.bundle import Bundle, probe_file
+from qsgm.fidelity import cosine
+from qsgm.finetuning import Settings, activations_before, constants_of, prepare, train
+from qsgm.folded import FloatArray, FoldedConv, FoldedSgm, float_trace
+from qsgm.quantize import (
+    QuantizedSgm,
+    SgmRanges,
+    constants,
+    constants_of_two_planes,
+    integer_forward,
+    quantize_sgm,
+)
+from qsgm.recalibration import ANY_LABEL, grown, ranges_of, recalibrated
+from qsgm.runtime import open_session
+from qsgm.train.graphs.build import Graph
+from qsgm.train.graphs.sgm import int8_sgm
+from qsgm.train.graphs.sharing import SharedConstants
+from tests.conftest import draw_frame
+
+KERNELS = pytest.mark.parametrize(("kernel", "side"), [(1, 1), (3, 4)], ids=["1x1", "3x3"])
+
+
+def random_sgm(rng: np.random.Generator, kernel: int) -> FoldedSgm:
+    convs = []
+    for into, out in pairwise((8 + 3, 20, 12, 8)):
+        weight, bias = rng.normal(size=(out, into, kernel, kernel)), rng.normal(size=out)
+        convs.append(FoldedConv(weight.astype(np.float32) / kernel, bias.astype(np.float32)))
+    return FoldedSgm(4 if kernel == 1 else 2, tuple(convs))
+
+
+def random_seen(rng: np.random.Generator, side: int) -> FloatArray:
+    """Activations (40, P, 8) and one of the labels each."""
+    activation = np.abs(rng.normal(size=(40, side**2, 8)))
+    labels = ANY_LABEL[rng.integers(len(ANY_LABEL), size=40)]
+    return np.concatenate(
+        [activation, np.tile(labels[:, None], (1, side**2, 1))], axis=2, dtype=np.float32
+    )
+
+
+def write_graph(q: QuantizedSgm, side: int, folder: Path) -> Path:
+    """The SGM alone as a graph, its constants in a file beside it."""
+    graph = Graph("sgm")
+    seen = graph.input("seen", np.float32, ("batch", side**2, len(q.input_low)))
+    gradient = int8_sgm(graph.within(f"layer{q.layer}"), q, side, seen)
+    graph.output("gradient", gradient, np.float32, ("batch", side**2, len(q.products[-1].bias)))
+    model, shared = graph.model(), SharedConstants("weights.bin")
+    shared.take_from([model])
+    (folder / "weights.bin").write_bytes(shared.data)
+    onnx.save(model, folder / "sgm.onnx")
+    return folder / "sgm.onnx"
+
+
+@KERNELS
+def test_exchanged_constants_make_the_graph_the_other_sgm_bit_for_bit(
+    kernel: int, side: int, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    sgm = random_sgm(rng, kernel)
+    seen = random_seen(rng, side)
+    own, other = (quantize_sgm(sgm, ranges_of(sgm, scale * seen[..., :8])) for scale in (0.01, 1.0))
+    path = write_graph(own, side, tmp_path)
+    for q, session in ((own, open_session(path)), (other, open_session(path, 1, constants(other)))):
+        gradient = session.run(None, {"seen": seen})[0]
+        np.testing.assert_array_equal(gradient, integer_forward(q, seen)[0])
+
+
+@KERNELS
+def test_a_graph_of_two_planes_gives_the_gradients_of_8_bit_sgms(
+    kernel: int, side: int, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(1)
+    sgm = random_sgm(rng, kernel)
+    seen = random_seen(rng, side)
+    ranges = ranges_of(sgm, seen[..., :8])
+    path = write_graph(quantize_sgm(sgm, ranges), side, tmp_path)
+    for weight_bits in (16, 8, 4):
+        q = quantize_sgm(sgm, ranges, 8, weight_bits)
+        session = open_session(path, 1, constants_of_two_planes(q))
+        gradient = session.run(None, {"seen": seen})[0]
+        np.testing.assert_array_equal(gradient, integer_forward(q, seen)[0])
+
+
+def test_ranges_cover_what_the_sgm_holds_under_any_label() -> None:
+    rng = np.random.default_rng(2)
+    for kernel, side in ((1, 1), (3, 4)):
+        sgm, seen = random_sgm(rng, kernel), random_seen(rng, side)
+        ranges = ranges_of(sgm, seen[..., :8])
+        assert (ranges.input_low <= seen.min(axis=(0, 1))).all()
+        assert (ranges.input_high >= seen.max(axis=(0, 1))).all()
+        for high, tensor in zip(ranges.hidden_high, float_trace(sgm, seen)[1], strict=True):
+            assert (high >= tensor.max(axis=(0, 1)) - 1e-5).all()
+
+
+def test_grown_ranges_leave_labels_alone() -> None:
+    ranges = SgmRanges(np.zeros(5, np.float32), np.ones(5, np.float32), (np.ones(4, np.float32),))
+    wide = grown(ranges, 1.5)
+    np.testing.assert_array_equal(wide.input_high, np.float32([1.5, 1.5, 1, 1, 1]))
+    np.testing.assert_array_equal(wide.hidden_high[0], np.full(4, 1.5, np.float32))
+
+
+def test_recalibration_mends_ranges_that_are_far_too_narrow(bundle: Bundle) -> None:
+    settings = Settings(epochs=1, layers=3)
+    prepared = prepare(draw_frame()[0], bundle, settings)
+    activations = activations_before(prepared, settings)
+    assert sorted(activations) == [4, 5]
+    hostile = {}
+    for layer, activation in activations.items():
+        sgm = bundle.float_sgm(layer)
+        narrow = quantize_sgm(sgm, ranges_of(sgm, 0.02 * activation), 8)
+        hostile[layer] = constants_of_two_planes(narrow)
+    clipping = train(prepared, settings, exchanged=hostile)
+    mended = train(prepared, replace(settings, recalibrate=True), exchanged=hostile)
+    for layer in (4, 5):
+        assert clipping.fidelity[layer].clipped_fraction > 0.05
+        assert clipping.fidelity[layer].cos_int8_float < 0.99
+        assert mended.fidelity[layer].clipped_fraction == 0
+        assert mended.fidelity[layer].cos_int8_float > 0.999
+
+
+def test_a_bundles_probe_takes_recalibrated_constants_for_all_its_sgms(bundle: Bundle) -> None:
+    rng = np.random.default_rng(3)
+    settings = Settings(epochs=0, layers=3)
+    prepared = prepare(draw_frame()[0], bundle, settings)
+    exchanged = recalibrated(bundle, activations_before(prepared, settings))
+    session = bundle.session(probe_file(3), 1, constants_of(exchanged, (4, 5)))
+    feeds = {"features": prepared.features, "labels": prepared.labels, **prepared.start}
+    rows = rng.choice(800, 32, replace=False)
+    for layer in (4, 5):
+        names = [f"activation{layer}", f"int8{layer}", f"float{layer}"]
+        activation, int8, floating = session.run(names, {**feeds, "rows": rows})
+        labels = prepared.labels[rows][:, None].repeat(activation.shape[1], axis=1)
+        seen = np.concatenate([activation, labels], axis=2)
+        sgm = bundle.float_sgm(layer)
+        q = quantize_sgm(sgm, ranges_of(sgm, activations_before(prepared, settings)[layer]))
+        np.testing.assert_array_equal(int8, integer_forward(q, seen)[0])
+        np.testing.assert_allclose(floating, float_trace(sgm, seen)[0], atol=1e-5)
+        assert cosine(int8, floating) > 0.999
