@@ -1,27 +1,38 @@
 """Ranges along whole runs: what the observers see is what the SGMs saw, frame after frame."""
 
 import hashlib
+import itertools
 import json
+import tracemalloc
+from io import StringIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
+from qsgm.cli import CalibratorName
 from qsgm.files import check_replaceable
+from qsgm.folded import FloatArray
 from qsgm.images import read_frame, write_png
+from qsgm.observers import CALIBRATORS, Observer, Span
+from qsgm.quantize import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train import calibrate as module
+from qsgm.train import export_report
 from qsgm.train.calibrate import (
+    AUTO,
+    Calibration,
     CalibrationSet,
-    MinMax,
     RunPlan,
-    SgmObservers,
     Trainee,
+    best_calibrator,
     calibrate,
     float_trace,
+    held_out_frames,
     measure,
     observe_frame,
     prepare,
@@ -31,10 +42,9 @@ from qsgm.train.calibrate import (
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
 from qsgm.train.draw_demo import draw_demo
-from qsgm.train.fold import FloatArray, fold_sgm, run_folded_sgm
+from qsgm.train.fold import fold_sgm, run_folded_sgm
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.objects import TABLE_KINDS
-from qsgm.train.quantize import quantize_sgm
 from qsgm.train.sgm import Sgm
 
 RATES = {str(single_layers(tuned)): (1e-3,) * tuned for tuned in (1, 2, 3)}
@@ -65,21 +75,6 @@ def ignore(_stage: str, _done: int, _of: int) -> None:
     pass
 
 
-def test_min_max_sees_everything_in_any_order_and_grouping() -> None:
-    values = np.random.default_rng(0).normal(size=(60, 5)).astype(np.float32)
-    whole, first, second = MinMax(5), MinMax(5), MinMax(5)
-    whole.update(values)
-    for batch in np.split(values[:40], 4):
-        first.update(batch)
-    second.update(values[40:])
-    kept = second.span()[0].copy()
-    second.merge(first)
-    for got, expected in zip(second.span(), whole.span(), strict=True):
-        np.testing.assert_array_equal(got, expected)
-    np.testing.assert_array_equal(whole.span(), [values.min(axis=0), values.max(axis=0)])
-    assert (second.span()[0] <= kept).all()
-
-
 @pytest.mark.parametrize(("layer", "side"), [(4, 1), (3, 7)])
 def test_the_float_trace_is_the_folded_sgm(layer: int, side: int) -> None:
     torch.manual_seed(layer)
@@ -108,7 +103,8 @@ def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trai
             steps = list(run(trainee, frames[i], plan, [0, i], gradient))
             assert [len(moment.labels[0]) for moment in steps] == [32, 32, 6]
     stages: list[tuple[str, int, int]] = []
-    ranges = calibrate(trainee, frames, 0, lambda *stage: stages.append(stage), EPOCHS)
+    watch = lambda *stage: stages.append(stage)  # noqa: E731
+    ranges = calibrate(trainee, frames, 0, watch, EPOCHS, "minmax").ranges
     assert stages == [("calibrate", done, 2) for done in (0, 1, 2)]
     assert [len(batches) for batches in seen.values()] == [6, 12]
     for layer, batches in seen.items():
@@ -134,18 +130,17 @@ def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
 
 def test_a_frame_alone_gives_part_of_the_ranges(folder: Path, trainee: Trainee) -> None:
     frames = CalibrationSet(folder)
-    both = calibrate(trainee, frames, 0, ignore, EPOCHS)
+    both = calibrate(trainee, frames, 0, ignore, EPOCHS, "minmax").ranges
     alone = observe_frame(trainee, frames[1], [0, 1], EPOCHS)
     for layer, observers in alone.items():
-        assert isinstance(observers, SgmObservers)
-        ranges = observers.ranges()
+        ranges = observers.ranges("minmax", 256)
         assert (ranges.input_low >= both[layer].input_low).all()
         assert (ranges.input_high <= both[layer].input_high).all()
 
 
 def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee: Trainee) -> None:
     frames = CalibrationSet(folder)
-    ranges = calibrate(trainee, frames, 0, ignore, EPOCHS)
+    ranges = calibrate(trainee, frames, 0, ignore, EPOCHS, "minmax").ranges
     int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in trainee.sgms.items()}
     fidelity = measure(trainee, int8, frames, 0, ignore, EPOCHS)
     assert set(fidelity) == {4, 5}
@@ -155,6 +150,147 @@ def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee
         assert layer.clipped_fraction < 1e-3
         # Untrained as it is, the SGM's gradient has nothing to do with the true one.
         assert layer.cos_int8_true == pytest.approx(layer.cos_float_true, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("count", "held_out"), [(1, []), (3, []), (4, [3]), (8, [3, 7]), (24, [3, 7, 11, 15, 19, 23])]
+)
+def test_every_fourth_frame_is_held_out(count: int, held_out: list[int]) -> None:
+    assert [*held_out_frames(count)] == held_out
+
+
+@pytest.mark.parametrize(
+    ("cosines", "best"),
+    [
+        ((0.5, 0.9, 0.8, 0.1), "percentile"),
+        ((0.99999, 0.999995, 0.999999, 0.5), "minmax"),  # a tie
+        ((0.99997, 0.999985, 0.999991, 0.999993), "percentile"),
+        ((-0.2, -0.1, -0.1, -0.05), "entropy"),
+    ],
+)
+def test_of_equal_calibrators_the_first_is_taken(cosines: tuple[float, ...], best: str) -> None:
+    assert best_calibrator(dict(zip(CALIBRATORS, cosines, strict=True))) == best
+
+
+def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
+    tmp_path: Path, trainee: Trainee
+) -> None:
+    draw_calibration_set(tmp_path / "calib", count=4, seed=3)
+    frames = CalibrationSet(tmp_path / "calib")
+    result = calibrate(trainee, frames, 0, ignore, EPOCHS, activation_bits=8)
+    assert result.held_out == 1
+    # By hand: ranges from the first three frames, cosines along the runs on the fourth.
+    seen = observe_frame(trainee, frames[0], [0, 0], EPOCHS)
+    for i in (1, 2):
+        for layer, observers in observe_frame(trainee, frames[i], [0, i], EPOCHS).items():
+            seen[layer].merge(observers)
+    inputs = []
+
+    def gradient(layer: int, values: FloatArray) -> FloatArray:
+        if layer == 4:
+            inputs.append(values)
+        return float_trace(trainee.sgms[layer], values)[0]
+
+    list(run(trainee, frames[3], RunPlan(3, 70, EPOCHS), [0, 3], gradient))
+    floating = float_trace(trainee.sgms[4], inputs[0])[0].ravel().astype(np.float64)
+    for name, cosine in result.cosines[4].items():
+        int8 = quantize_sgm(trainee.sgms[4], seen[4].ranges(name, 256), 8)
+        got = integer_forward(int8, inputs[0])[0].ravel().astype(np.float64)
+        expected = got @ floating / np.linalg.norm(got) / np.linalg.norm(floating)
+        assert cosine == pytest.approx(expected, rel=0, abs=1e-12)
+    assert [*result.cosines[4]] == [*CALIBRATORS]
+    assert result.chosen == {k: best_calibrator(result.cosines[k]) for k in (4, 5)}
+    # The frame held out has its part in the ranges all the same.
+    for layer, observers in observe_frame(trainee, frames[3], [0, 3], EPOCHS).items():
+        seen[layer].merge(observers)
+        expected = seen[layer].ranges(result.chosen[layer], 256)
+        assert_same_ranges(result.ranges[layer], expected)
+
+
+def assert_same_ranges(got: SgmRanges, expected: SgmRanges) -> None:
+    np.testing.assert_array_equal(got.input_low, expected.input_low)
+    np.testing.assert_array_equal(got.input_high, expected.input_high)
+    for tensor, other in zip(got.hidden_high, expected.hidden_high, strict=True):
+        np.testing.assert_array_equal(tensor, other)
+
+
+def test_few_frames_judge_the_ranges_taken_from_them(folder: Path, trainee: Trainee) -> None:
+    stages: list[tuple[str, int, int]] = []
+    watch = lambda *stage: stages.append(stage)  # noqa: E731
+    result = calibrate(trainee, CalibrationSet(folder), 0, watch, EPOCHS, activation_bits=8)
+    assert result.held_out == 0
+    assert stages[3:] == [("choose", done, 2) for done in (0, 1, 2)]
+    assert all(0.9 < value <= 1 for value in result.cosines[5].values())
+
+
+def test_auto_takes_the_calibrator_that_does_best(
+    folder: Path, trainee: Trainee, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def tenfold(seen: Observer, _levels: int) -> Span:
+        return 10 * seen.low, 10 * seen.high
+
+    monkeypatch.setitem(module.CALIBRATORS, "minmax", tenfold)
+    result = calibrate(trainee, CalibrationSet(folder), 0, ignore, EPOCHS, activation_bits=8)
+    for layer, name in result.chosen.items():
+        assert name != "minmax"
+        assert result.cosines[layer]["minmax"] < result.cosines[layer][name]
+
+
+def test_a_named_calibrator_gives_all_ranges_and_is_not_compared(
+    folder: Path, trainee: Trainee
+) -> None:
+    frames = CalibrationSet(folder)
+    seen = observe_frame(trainee, frames[0], [0, 0], EPOCHS)
+    for layer, observers in observe_frame(trainee, frames[1], [0, 1], EPOCHS).items():
+        seen[layer].merge(observers)
+    for name, bits in itertools.product(CALIBRATORS, ACTIVATION_BITS):
+        result = calibrate(trainee, frames, 0, ignore, EPOCHS, name, bits)
+        assert result.chosen == {4: name, 5: name}
+        assert result.cosines == {4: {}, 5: {}}
+        for layer, ranges in result.ranges.items():
+            assert_same_ranges(ranges, seen[layer].ranges(name, 2**bits))
+    narrow, wide = (seen[4].ranges("mse", 2**bits) for bits in ACTIVATION_BITS)
+    assert (narrow.hidden_high[0] < wide.hidden_high[0]).any()  # bits are not all the same to it
+    with pytest.raises(QsgmError, match=r"no calibrator 'median'; take one of auto, minmax, .*mse"):
+        calibrate(trainee, frames, 0, ignore, EPOCHS, "median")
+
+
+@pytest.mark.parametrize(("held_out", "why"), [(6, "held-out frames, 6"), (0, "too few to hold")])
+def test_the_report_says_which_calibrator_was_taken_and_why(held_out: int, why: str) -> None:
+    cosines = {4: {"minmax": 0.9912341, "mse": 0.99}, 5: {"minmax": 0.98, "mse": 0.9956781}}
+    shown = StringIO()
+    Console(file=shown, width=80).print(
+        export_report.calibrators(Calibration({}, {4: "minmax", 5: "mse"}, cosines, held_out))
+    )
+    rows = [line.split() for line in shown.getvalue().splitlines()]
+    assert ["layer", "minmax", "mse", "taken"] in rows
+    assert ["4", "0.991234", "0.990000", "minmax"] in rows
+    assert ["5", "0.980000", "0.995678", "mse"] in rows
+    assert why in " ".join(shown.getvalue().split())
+    asked = Calibration({}, {4: "mse", 5: "mse"}, {4: {}, 5: {}}, 0)
+    assert str(export_report.calibrators(asked)) == "ranges: mse, as asked"
+
+
+def test_the_command_line_offers_every_calibrator() -> None:
+    assert [name.value for name in CalibratorName] == [AUTO, *CALIBRATORS]
+
+
+def test_memory_of_calibration_does_not_grow_with_its_frames(
+    tmp_path: Path, trainee: Trainee, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "CROPS", 33)
+    draw_calibration_set(tmp_path / "calib", count=6, seed=3)
+    frames = CalibrationSet(tmp_path / "calib")
+    entries, peaks = frames._entries, []
+    for count in (2, 2, 6):  # the first run fills caches
+        frames._entries = entries[:count]
+        tracemalloc.start()
+        calibrate(trainee, frames, 0, ignore, EPOCHS, activation_bits=8)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # Kept, what SGMs see in a frame's three passes over 33 crops would be 13 KB, the frame 900 KB.
+    values = 3 * 33 * (19 + 8 + 6) * 4
+    assert peaks[2] - peaks[1] < 4 * values / 2
 
 
 def test_a_run_that_diverges_is_refused(folder: Path, trainee: Trainee) -> None:
@@ -184,8 +320,8 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
     rates = {str(single_layers(tuned)): (1e-4,) * tuned for tuned in range(1, 6)}
     of_five = prepare(Checkpoint(GraspNet().eval(), sgms, {}, Loss(), rates, {}))
     frames = CalibrationSet(folder)
-    ranges = calibrate(of_five, frames, 0, ignore, EPOCHS)
-    whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS)
+    ranges = calibrate(of_five, frames, 0, ignore, EPOCHS, "minmax").ranges
+    whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS, "minmax").ranges
     for layer in (4, 5):  # as if there were no others
         np.testing.assert_array_equal(ranges[layer].input_high, whole[layer].input_high)
     seen: dict[int, list[FloatArray]] = {layer: [] for layer in of_five.sgms}

@@ -3,6 +3,10 @@
 Activations move while layers train, so ranges are taken from the first step to the last, on every
 calibration frame, channel by channel. Values are looked at and dropped: one frame is in memory at
 a time, and of each run only its current step.
+
+Which calibrator suits a layer is not known beforehand. The default tries them all on some of the
+frames, with ranges from the others, and takes for each layer the one whose int8 gradients point
+most nearly where the float ones do.
 """
 
 import hashlib
@@ -13,31 +17,41 @@ from dataclasses import dataclass
 from itertools import islice
 from math import isfinite
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from qsgm.blocks import single_layers
+from qsgm.blocks import single_layers, tuned_layers
 from qsgm.errors import QsgmError
-from qsgm.fidelity import LayerFidelity, compare, mean_over_run
+from qsgm.fidelity import Gradients, LayerFidelity, compare, cosine, mean_over_run
+from qsgm.folded import FloatArray, FoldedConv, FoldedSgm
 from qsgm.images import read_demonstration
-from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.fold import (
-    FloatArray,
-    FoldedConv,
-    FoldedNet,
-    FoldedSgm,
-    fold_net,
-    fold_sgm,
-    run_folded_conv,
+from qsgm.observers import CALIBRATORS, SgmObservers
+from qsgm.quantize import (
+    ActivationBits,
+    QuantizedSgm,
+    SgmRanges,
+    integer_forward,
+    quantize_sgm,
+    underflow_fraction,
 )
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv
 from qsgm.train.graspnet import LAYERS
-from qsgm.train.local import LayerState, local_step, loss_gradient, true_gradients
+from qsgm.train.local import (
+    LayerState,
+    columns,
+    layer_forward,
+    local_step,
+    loss_gradient,
+    through_activation,
+    true_gradients,
+    weight_gradients,
+)
 from qsgm.train.maml import MOMENTUM
-from qsgm.train.quantize import QuantizedSgm, SgmRanges, integer_forward
 from qsgm.train.tasks import Task, make_task, start_states
 from qsgm.tuning import BATCH, rate_factor
 from qsgm.weights import to_step_layout
@@ -53,17 +67,20 @@ ONE_POSITION = 3
 # activations of those layers move little, and every crop gives as many samples as its map is large.
 MAP_CROPS = 96
 MAP_EPOCHS = 10
-# The label is known before anything is seen: quality, sine, cosine.
-LABEL_LOW = np.array([0, -1, -1], np.float32)
-LABEL_HIGH = np.array([1, 1, 1], np.float32)
 # Steps between two measurements of fidelity; consecutive steps tell the same.
 MEASURE_EVERY_STEPS = 13
 MEASURE_MAPS_EVERY_STEPS = 15
+# Not a calibrator: for each layer the best of them.
+AUTO = "auto"
+HELD_OUT_EVERY = 4
+EQUAL_COSINE = 1e-5
 
 # (what is going on, frames done, of how many)
 Watch = Callable[[str, int, int], None]
 # (layer, what its SGM sees (B, P, Ci)) -> gradient (B, P, C)
 SgmGradient = Callable[[int, FloatArray], FloatArray]
+# layer: calibrator: the SGM
+Candidates = Mapping[int, Mapping[str, QuantizedSgm]]
 
 
 @dataclass(frozen=True)
@@ -158,73 +175,17 @@ def _entry(file: Any, sha256: Any, center_px: Any) -> _Entry:
     return _Entry(file, sha256, (x, y))
 
 
-class Observer(Protocol):
-    """Watches the channels of one tensor and says what span of values int8 has to cover."""
+@dataclass(frozen=True)
+class Calibration:
+    """Every SGM's ranges, whose they are, and why; all by layer."""
 
-    def update(self, values: FloatArray) -> None:
-        """Look at values (..., C) before they are dropped."""
-        ...
-
-    def merge(self, other: Self) -> None:
-        """Take in what another observer of the same tensor has seen."""
-        ...
-
-    def span(self) -> tuple[FloatArray, FloatArray]:
-        """Low and high end of each channel, (C,) each."""
-        ...
-
-
-class MinMax:
-    """Everything that was seen."""
-
-    name = "minmax"
-
-    def __init__(self, channels: int) -> None:
-        self._low = np.full(channels, np.inf, np.float32)
-        self._high = np.full(channels, -np.inf, np.float32)
-
-    def update(self, values: FloatArray) -> None:
-        flat = values.reshape(-1, values.shape[-1])
-        self._include(flat.min(axis=0), flat.max(axis=0))
-
-    def merge(self, other: Self) -> None:
-        self._include(*other.span())
-
-    def span(self) -> tuple[FloatArray, FloatArray]:
-        return self._low, self._high
-
-    def _include(self, low: FloatArray, high: FloatArray) -> None:
-        # Not in place: what `span` gave away stays as it was.
-        self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
-
-
-class SgmObservers:
-    """Observers of everything in one SGM that gets a range: its activation, its hidden tensors."""
-
-    def __init__(self, sgm: FoldedSgm, make: Callable[[int], Observer] = MinMax) -> None:
-        self._activation = make(len(sgm.convs[-1].bias))
-        self._hidden = [make(len(conv.bias)) for conv in sgm.convs[:-1]]
-
-    def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
-        """One batch: inputs (B, P, Ci) and hidden tensors (B, P, H), after ReLU."""
-        self._activation.update(seen[..., : -len(LABEL_LOW)])
-        for observer, values in zip(self._hidden, hidden, strict=True):
-            observer.update(values)
-
-    def merge(self, other: "SgmObservers") -> None:
-        """Take in what was seen on another frame."""
-        self._activation.merge(other._activation)
-        for observer, others in zip(self._hidden, other._hidden, strict=True):
-            observer.merge(others)
-
-    def ranges(self) -> SgmRanges:
-        """What the SGM's int8 version has to cover."""
-        low, high = self._activation.span()
-        return SgmRanges(
-            np.concatenate([low, LABEL_LOW]),
-            np.concatenate([high, LABEL_HIGH]),
-            tuple(observer.span()[1] for observer in self._hidden),
-        )
+    ranges: dict[int, SgmRanges]
+    chosen: dict[int, str]  # calibrator
+    # calibrator: mean cosine of int8 to float gradients; empty where none was to be chosen
+    cosines: dict[int, dict[str, float]]
+    # Frames that the cosines were measured on and the ranges then compared were not taken from;
+    # 0: both were all frames.
+    held_out: int
 
 
 @dataclass(frozen=True)
@@ -277,6 +238,11 @@ class RunPlan:
         """The layers of the SGMs that it is there for."""
         return range(LAYERS + 1 - self.tuned, LAYERS + 1 - ONE_POSITION if self.maps else LAYERS)
 
+    @property
+    def measure_every(self) -> int:
+        """Steps between two measurements."""
+        return MEASURE_MAPS_EVERY_STEPS if self.maps else MEASURE_EVERY_STEPS
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -303,8 +269,14 @@ def run_plans(most_layers: int, epochs: int) -> list[RunPlan]:
 
 
 def calibrate(
-    trainee: Trainee, frames: CalibrationSet, seed: int, watch: Watch, epochs: int = EPOCHS
-) -> dict[int, SgmRanges]:
+    trainee: Trainee,
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int = EPOCHS,
+    calibrator: str = AUTO,
+    activation_bits: ActivationBits = 16,
+) -> Calibration:
     """Fine-tune on every frame with the float SGMs and take each SGM's ranges on the way.
 
     Layers are tuned by twos and by threes: the SGM behind layer 5 serves both. Where SGMs stand
@@ -316,20 +288,62 @@ def calibrate(
         seed: of crops and batches.
         watch: told about progress.
         epochs: length of a whole run.
-
-    Returns:
-        Ranges by layer.
+        calibrator: one of :data:`qsgm.observers.CALIBRATORS`, or :data:`AUTO`: for each layer
+            the one that does best on frames held out.
+        activation_bits: of the int8 SGMs.
 
     Raises:
-        QsgmError: a run diverged, or a frame cannot be used.
+        QsgmError: there is no such calibrator, a run diverged, or a frame cannot be used.
     """
-    total = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
+    refuse_unknown(calibrator)
+    held_out = held_out_frames(len(frames)) if calibrator == AUTO else range(0)
+    everything, compared = observe(trainee, frames, seed, watch, epochs, held_out)
+    levels = 2**activation_bits
+    if calibrator == AUTO:
+        candidates = quantize_all(trainee, compared, activation_bits)
+        judges = held_out or range(len(frames))
+        cosines = judge(trainee, candidates, frames, judges, seed, watch, epochs)
+        chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
+    else:
+        cosines = {layer: {} for layer in trainee.sgms}
+        chosen = dict.fromkeys(trainee.sgms, calibrator)
+    ranges = {layer: everything[layer].ranges(chosen[layer], levels) for layer in trainee.sgms}
+    return Calibration(ranges, chosen, cosines, len(held_out))
+
+
+def refuse_unknown(calibrator: str) -> None:
+    """Raise QsgmError for a name that is no calibrator's."""
+    if calibrator not in (AUTO, *CALIBRATORS):
+        raise QsgmError(
+            f"there is no calibrator {calibrator!r}; take one of {', '.join((AUTO, *CALIBRATORS))}"
+        )
+
+
+def held_out_frames(count: int) -> range:
+    """Every fourth; of fewer frames than that, none can be spared."""
+    return range(HELD_OUT_EVERY - 1, count, HELD_OUT_EVERY)
+
+
+def observe(
+    trainee: Trainee,
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int,
+    held_out: range,
+) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers]]:
+    """What each SGM sees in the runs on all frames, and on those that are not held out."""
+    everything, compared = (
+        {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
+    )
     for i in range(len(frames)):
         watch("calibrate", i, len(frames))
-        for layer, observers in observe_frame(trainee, frames[i], [seed, i], epochs).items():
-            total[layer].merge(observers)
+        for layer, seen in observe_frame(trainee, frames[i], [seed, i], epochs).items():
+            everything[layer].merge(seen)
+            if i not in held_out:
+                compared[layer].merge(seen)
     watch("calibrate", len(frames), len(frames))
-    return {layer: observers.ranges() for layer, observers in total.items()}
+    return everything, compared
 
 
 def observe_frame(
@@ -350,6 +364,94 @@ def observe_frame(
     return observers
 
 
+def quantize_all(
+    trainee: Trainee, seen: Mapping[int, SgmObservers], activation_bits: ActivationBits
+) -> Candidates:
+    """The int8 SGMs by every calibrator's ranges."""
+    levels = 2**activation_bits
+    return {
+        layer: {
+            name: quantize_sgm(sgm, seen[layer].ranges(name, levels), activation_bits)
+            for name in CALIBRATORS
+        }
+        for layer, sgm in trainee.sgms.items()
+    }
+
+
+def judge(
+    trainee: Trainee,
+    candidates: Candidates,
+    frames: CalibrationSet,
+    judges: range,
+    seed: int,
+    watch: Watch,
+    epochs: int,
+) -> dict[int, dict[str, float]]:
+    """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.
+
+    The float SGMs drive the runs, so that all calibrators are asked the same.
+    """
+    cosines: dict[int, dict[str, list[float]]] = {
+        layer: {name: [] for name in CALIBRATORS} for layer in candidates
+    }
+    for done, i in enumerate(judges):
+        watch("choose", done, len(judges))
+        for plan in measured_plans(trainee, epochs):
+            for layer, name, value in judge_run(trainee, candidates, frames[i], plan, [seed, i]):
+                cosines[layer][name].append(value)
+    watch("choose", len(judges), len(judges))
+    return {
+        layer: {name: float(np.mean(values)) for name, values in by_name.items()}
+        for layer, by_name in cosines.items()
+    }
+
+
+def judge_run(
+    trainee: Trainee,
+    candidates: Candidates,
+    demonstration: Demonstration,
+    plan: RunPlan,
+    seed: list[int],
+) -> Iterator[tuple[int, str, float]]:
+    """Every now and then along one run, each calibrator's cosine at each SGM it is there for."""
+
+    def driver(layer: int, seen: FloatArray) -> FloatArray:
+        return float_trace(trainee.sgms[layer], seen)[0]
+
+    steps = run(trainee, demonstration, plan, seed, driver)
+    for moment in islice(steps, 0, None, plan.measure_every):
+        for layer, (seen, floating) in float_moment(trainee, moment).items():
+            if layer in plan.measured:
+                for name, sgm in candidates[layer].items():
+                    yield layer, name, cosine(integer_forward(sgm, seen)[0], floating)
+
+
+def float_moment(trainee: Trainee, moment: Moment) -> dict[int, tuple[FloatArray, FloatArray]]:
+    """What each SGM sees on one batch, and its float gradient; nothing moves."""
+    found = {}
+
+    def gradient(layer: int, seen: FloatArray) -> FloatArray:
+        floating, _ = float_trace(trainee.sgms[layer], seen)
+        found[layer] = seen, floating
+        return floating
+
+    still = [torch.zeros(())] * len(moment.states)
+    step(trainee, moment, still, gradient)
+    return found
+
+
+def best_calibrator(cosines: Mapping[str, float]) -> str:
+    """The one with the highest cosine; of equals the first."""
+    best = max(cosines.values())
+    return next(name for name, value in cosines.items() if value >= best - EQUAL_COSINE)
+
+
+def measured_plans(trainee: Trainee, epochs: int) -> list[RunPlan]:
+    """The runs that show all SGMs: those of two layers are part of those of three."""
+    most = trainee.checkpoint.most_layers
+    return [plan for plan in run_plans(most, epochs) if plan.tuned >= min(most, ONE_POSITION)]
+
+
 def measure(
     trainee: Trainee,
     int8_sgms: Mapping[int, QuantizedSgm],
@@ -365,12 +467,9 @@ def measure(
     taken along the short runs of all layers, which the float SGMs drive: they are quicker here.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
-    most = trainee.checkpoint.most_layers
-    # Two layers are part of three.
-    plans = [plan for plan in run_plans(most, epochs) if plan.tuned >= min(most, ONE_POSITION)]
     for i in range(len(frames)):
         watch("measure", i, len(frames))
-        for plan in plans:
+        for plan in measured_plans(trainee, epochs):
             for layer, fidelity in measure_run(trainee, int8_sgms, frames[i], plan, [seed, i]):
                 measured[layer].append(fidelity)
     watch("measure", len(frames), len(frames))
@@ -391,8 +490,8 @@ def measure_run(
             return float_trace(trainee.sgms[layer], seen)[0]
         return integer_forward(int8_sgms[layer], seen)[0]
 
-    every = MEASURE_MAPS_EVERY_STEPS if plan.maps else MEASURE_EVERY_STEPS
-    for moment in islice(run(trainee, demonstration, plan, seed, driver), 0, None, every):
+    steps = run(trainee, demonstration, plan, seed, driver)
+    for moment in islice(steps, 0, None, plan.measure_every):
         yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
 
 
@@ -401,18 +500,43 @@ def compare_moment(
 ) -> dict[int, LayerFidelity]:
     """Int8, float and true gradients on one batch behind `layers`, as they are at that moment."""
     true = true_gradients(moment.states, moment.features, moment.labels, trainee.checkpoint.loss)
-    fidelity = {}
-
-    def gradient(layer: int, seen: FloatArray) -> FloatArray:
-        floating, _ = float_trace(trainee.sgms[layer], seen)
+    fidelity, passes = {}, passes_of(moment)
+    for layer, (seen, floating) in float_moment(trainee, moment).items():
         if layer in layers:
             int8, clipped = integer_forward(int8_sgms[layer], seen)
-            fidelity[layer] = compare(int8, floating, true[layer][0].numpy(), clipped)
-        return floating
-
-    still = [torch.zeros(())] * len(moment.states)
-    step(trainee, moment, still, gradient)
+            given = (int8, floating, true[layer][0].numpy())
+            updates = (update_from(layer, *passes[layer], gradient) for gradient in given)
+            fidelity[layer] = compare(
+                Gradients(*given),
+                Gradients(*updates),
+                clipped,
+                underflow_fraction(int8_sgms[layer], seen),
+            )
     return fidelity
+
+
+def passes_of(moment: Moment) -> dict[int, tuple[Tensor, Tensor]]:
+    """By layer, the windows (1, B, P, K) it sees and its pre-activation (1, B, P, C)."""
+    passes, x = {}, moment.features
+    for layer, state in zip(tuned_layers(len(moment.states)), moment.states, strict=True):
+        windows = columns(layer, x)
+        before, x = layer_forward(layer, state, windows)
+        passes[layer] = windows, before
+    return passes
+
+
+def update_from(layer: int, windows: Tensor, before: Tensor, gradient: FloatArray) -> FloatArray:
+    """Gradients of a layer's weight and bias, one after the other, from one on its activation.
+
+    Args:
+        layer: its number.
+        windows: of its input, (1, B, P, K).
+        before: its pre-activation, (1, B, P, C).
+        gradient: (B, P', C), each sample's own.
+    """
+    dz = through_activation(layer, before, torch.from_numpy(gradient)[None])
+    parts = weight_gradients(windows, dz)
+    return torch.cat([part.flatten() for part in parts]).numpy()
 
 
 def run(

@@ -1,20 +1,21 @@
 """What exporting found out: as JSON, as a table, and as the bundle's model card."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
+from qsgm.folded import FoldedSgm
+from qsgm.observers import LABEL_LOW
+from qsgm.quantize import QuantizedSgm, SgmRanges, constants
 from qsgm.report import fidelity_json, plain_table
-from qsgm.train.calibrate import LABEL_LOW, MinMax
-from qsgm.train.fold import FoldedSgm
-from qsgm.train.quantize import QuantizedSgm, SgmRanges
+from qsgm.train.calibrate import EQUAL_COSINE, Calibration
 
 # (line break: in a terminal only)
 _HEADERS = (
@@ -50,11 +51,7 @@ class LayerReport:
     @property
     def int8_bytes(self) -> int:
         """Of its constants, scales included."""
-        arrays: list[NDArray[Any]] = [self.int8_sgm.input_low, self.int8_sgm.input_gain]
-        for product in self.int8_sgm.products:
-            arrays += [product.weight, product.fine, product.bias]
-            arrays += [product.scale, product.fine_scale]
-        return sum(array.nbytes for array in arrays)
+        return sum(array.nbytes for array in constants(self.int8_sgm).values())
 
     @property
     def activation_range(self) -> tuple[float, float]:
@@ -108,6 +105,7 @@ class ExportReport:
 
     output: str
     layers: dict[int, LayerReport]
+    calibration: Calibration
     fold_max_abs_error: float
     bundle_bytes: int
 
@@ -116,7 +114,12 @@ class ExportReport:
         layers = self.layers.values()
         return {
             "output": self.output,
-            "calibrator": {str(k): MinMax.name for k in self.layers},
+            "calibrator": {str(k): self.calibration.chosen[k] for k in self.layers},
+            "calibrators": {
+                str(k): {name: round(value, 7) for name, value in cosines.items()}
+                for k, cosines in self.calibration.cosines.items()
+            },
+            "held_out_frames": self.calibration.held_out,
             "layers": {str(k): layer.to_json() for k, layer in self.layers.items()},
             "fold_max_abs_error": _short(self.fold_max_abs_error)[0],
             "bytes": {
@@ -127,7 +130,7 @@ class ExportReport:
         }
 
     def __rich__(self) -> RenderableType:
-        return Group(table(self), Text(LEGEND, style="dim"))
+        return Group(table(self), Text(LEGEND + "\n", style="dim"), calibrators(self.calibration))
 
 
 @dataclass(frozen=True)
@@ -152,11 +155,64 @@ def table(report: ExportReport) -> Table:
     return result
 
 
+def calibrators(calibration: Calibration) -> RenderableType:
+    """Whose ranges each SGM has, and why."""
+    why = Text(ranges_from(calibration), style="dim")
+    if not judged(calibration):
+        return why
+    result = plain_table("cos int8,float of each calibrator's ranges")
+    for header in calibrator_headers(calibration):
+        result.add_column(header, justify="right", no_wrap=True)
+    for row in calibrator_rows(calibration):
+        result.add_row(*row)
+    return Group(result, why)
+
+
+def judged(calibration: Calibration) -> bool:
+    """Whether calibrators were compared at all."""
+    return any(calibration.cosines.values())
+
+
+def ranges_from(calibration: Calibration) -> str:
+    """In one sentence, whose ranges the SGMs have."""
+    if not judged(calibration):
+        return f"ranges: {', '.join(sorted(set(calibration.chosen.values())))}, as asked"
+    frames = "the calibration frames themselves, too few to hold any out"
+    if calibration.held_out:
+        frames = f"held-out frames, {calibration.held_out} in number"
+    return (
+        f"ranges: from the calibrator with the highest mean cos int8,float on {frames}; within "
+        f"{EQUAL_COSINE:g} of it, from the first"
+    )
+
+
+def calibrator_headers(calibration: Calibration) -> list[str]:
+    """Of the columns of :func:`calibrator_rows`."""
+    return ["layer", *next(iter(calibration.cosines.values())), "taken"]
+
+
+def calibrator_rows(calibration: Calibration) -> list[list[str]]:
+    """By layer: each calibrator's cosine, and which was taken."""
+    return [
+        [str(layer), *(f"{value:.6f}" for value in cosines.values()), calibration.chosen[layer]]
+        for layer, cosines in calibration.cosines.items()
+    ]
+
+
+def markdown(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in [headers, ["--:"] * len(headers), *rows])
+
+
 def model_card(report: ExportReport, provenance: Provenance) -> str:
     """The bundle's README.md."""
     headers = [" ".join(header.split()) for header in _HEADERS]
-    rows = [headers, ["--:"] * len(headers), *(one.cells() for one in report.layers.values())]
-    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    lines = markdown(headers, [one.cells() for one in report.layers.values()])
+    calibration = report.calibration
+    whose = f"R{ranges_from(calibration)[1:]}."
+    if judged(calibration):
+        rows = calibrator_rows(calibration)
+        whose += f"\n\n{markdown(calibrator_headers(calibration), rows)}"
     card = json.dumps(provenance.card, indent=1, sort_keys=True)
     return f"""# GraspNet with int8 synthetic gradient modules
 
@@ -167,7 +223,7 @@ is in them. Batchnorm is folded into the convolutions (largest change of any out
 | file | what |
 | --- | --- |
 | `network.onnx` | a frame to its heatmap |
-| `trunk_N.onnx` | crops to features, when the last N layers are tuned |
+| `trunk_P_N.onnx` | crops to u8 features when the last N layers are tuned, the others in P |
 | `head_N.onnx` | features to outputs |
 | `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step, SGD or Adam; B: layers in blocks |
 | `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
@@ -190,11 +246,13 @@ How the checkpoint was pretrained, and what it scored:
 ## The int8 SGMs
 
 u8 activations, weights of two s8 planes (one holds what rounding to the other left), a scale for
-every channel (calibrator: {MinMax.name}), float gradients out. Measured while the int8 SGMs
+every channel, float gradients out. Measured while the int8 SGMs
 fine-tuned the last three layers on the calibration frames; behind layers 1 to 3, where there are
 SGMs, on batches along shorter runs of all layers. {LEGEND.capitalize()}.
 
 {lines}
+
+{whose}
 """
 
 
