@@ -28,13 +28,26 @@ FIDELITY_LEGEND = (
 )
 # (key, header, format)
 _FIDELITY_COLUMNS = (
-    ("cos_int8_float", "cos\nint8,float", "{:.4f}"),
+    ("cos_int8_float", "cos\nint8,float", "{:.5f}"),
     ("cos_int8_true", "cos\nint8,true", "{:.3f}"),
     ("cos_float_true", "cos\nfloat,true", "{:.3f}"),
     ("norm_ratio_int8_true", "norm\nratio", "{:.2f}"),
     ("sign_agreement_int8_float", "signs\nagree", "{:.3f}"),
     ("sqnr_db", "SQNR\n[dB]", "{:.1f}"),
     ("clipped_fraction", "\nclipped", "{:.4f}"),
+)
+DETAIL_LEGEND = (
+    "angle: between int8 and float; weighted error: of int8, its components weighted by |float|; "
+    "sample: each sample's own cosine; update: cosine of what the layer's weights get"
+)
+_DETAIL_COLUMNS = (
+    ("direction_deviation_deg", "angle\n[°]", "{:.2f}"),
+    ("weighted_error", "weighted\nerror", "{:.4f}"),
+    ("cos_sample_int8_float", "sample\nint8,float", "{:.4f}"),
+    ("cos_sample_int8_true", "sample\nint8,true", "{:.3f}"),
+    ("cos_update_int8_float", "update\nint8,float", "{:.4f}"),
+    ("cos_update_int8_true", "update\nint8,true", "{:.3f}"),
+    ("cos_update_float_true", "update\nfloat,true", "{:.3f}"),
 )
 
 
@@ -72,6 +85,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "seconds": seconds_json(result.seconds),
         "peak_activation_bytes": result.peak_activation_bytes,
         "blocks": str(result.blocks),
+        "trunk": result.trunk,
         "optimizer": result.recipe.optimizer,
         "rates": list(result.recipe.rates_over(result.steps)),
         "orientation_deg": angle(math.degrees(result.prepared.offset_rad), 2),
@@ -92,8 +106,11 @@ def fidelity_command_json(result: "FinetuneResult", name: str) -> dict[str, Any]
     """What `qsgm fidelity` prints: the part of :func:`finetune_json` that concerns gradients."""
     keys = ("method", "precision", "layers", "epochs", "seed", "bundle", "fidelity")
     everything = finetune_json(result, name, Path())
-    wanted = {key: everything[key] for key in ("object", *keys, "warnings")}
-    return wanted | {"fidelity_over_run": fidelity_over_run_json(result)}
+    wanted = {key: everything[key] for key in ("object", *keys, "trunk", "warnings")}
+    return wanted | {
+        "every": result.settings.probe_every,
+        "fidelity_over_run": fidelity_over_run_json(result),
+    }
 
 
 def predict_json(
@@ -126,9 +143,10 @@ def fidelity_json(layer: LayerFidelity) -> dict[str, float | None]:
 
 
 def fidelity_over_run_json(result: "FinetuneResult") -> list[dict[str, Any]]:
-    """Every probe: its epoch (0: before the first step) and its layers' metrics."""
+    """Every probe: its step (0: before the first one), epoch, and its layers' metrics."""
     return [
-        {"epoch": probe.epoch, **{str(k): fidelity_json(v) for k, v in probe.layers.items()}}
+        {"step": probe.step, "epoch": number(probe.epoch, 5)}
+        | {str(k): fidelity_json(v) for k, v in probe.layers.items()}
         for probe in result.probes
     ]
 
@@ -151,8 +169,25 @@ def fidelity_report(result: "FinetuneResult") -> RenderableType:
     parts: list[RenderableType] = []
     if result.probes:
         parts += [fidelity_table(result.fidelity), Text(FIDELITY_LEGEND, style="dim")]
-    parts += [Text(f"note: {warning}", style="yellow") for warning in result.warnings]
-    return Group(*parts)
+    return Group(*parts, *warning_lines(result))
+
+
+def fidelity_command_report(result: "FinetuneResult") -> RenderableType:
+    """What `qsgm fidelity` shows: both tables with their legends, when it looked, and warnings."""
+    last, every = result.probes[-1].step, result.settings.probe_every
+    return Group(
+        fidelity_table(result.fidelity),
+        Text(FIDELITY_LEGEND, style="dim"),
+        detail_table(result.fidelity),
+        Text(DETAIL_LEGEND, style="dim"),
+        Text(f"probes: {len(result.probes)}, at steps 0 to {last} by {every}"),
+        *warning_lines(result),
+    )
+
+
+def warning_lines(result: "FinetuneResult") -> list[Text]:
+    """One line for every warning."""
+    return [Text(f"note: {warning}", style="yellow") for warning in result.warnings]
 
 
 def before_after_table(result: "FinetuneResult", name: str) -> Table:
@@ -173,13 +208,28 @@ def before_after_table(result: "FinetuneResult", name: str) -> Table:
 def fidelity_table(fidelity: Mapping[int, LayerFidelity]) -> Table:
     """One row per SGM layer; :data:`FIDELITY_LEGEND` goes below."""
     table = plain_table("how faithful the gradients were")
+    _add_layers(table, fidelity, _FIDELITY_COLUMNS)
+    return table
+
+
+def detail_table(fidelity: Mapping[int, LayerFidelity]) -> Table:
+    """The other metrics, a row per SGM layer; :data:`DETAIL_LEGEND` goes below."""
+    table = plain_table("sample by sample, and what the weights get")
+    table.padding = 0  # the lines between columns are blanks, and 80 columns have to do
+    _add_layers(table, fidelity, _DETAIL_COLUMNS)
+    return table
+
+
+def _add_layers(
+    table: Table, fidelity: Mapping[int, LayerFidelity], columns: Sequence[tuple[str, str, str]]
+) -> None:
+    """Columns (key, header, format), and a row per SGM layer."""
     table.add_column("\nlayer", justify="right")
-    for _, header, _ in _FIDELITY_COLUMNS:
+    for _, header, _ in columns:
         table.add_column(Text(header), justify="right")
     for layer, values in sorted(fidelity.items()):
-        cells = [form.format(getattr(values, key)) for key, _, form in _FIDELITY_COLUMNS]
+        cells = [form.format(getattr(values, key)) for key, _, form in columns]
         table.add_row(str(layer), *cells)
-    return table
 
 
 def seconds_line(seconds: Mapping[str, float]) -> Text:

@@ -8,8 +8,10 @@ from onnx import ModelProto
 from qsgm.angles import AngleEncoding
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
-from qsgm.train.fold import FoldedNet, FoldedSgm
-from qsgm.train.graphs.build import Graph
+from qsgm.folded import FoldedSgm
+from qsgm.quantize import QuantizedSgm
+from qsgm.train.fold import FoldedNet
+from qsgm.train.graphs.build import Graph, Value
 from qsgm.train.graphs.layers import (
     Batch,
     Pass,
@@ -20,6 +22,7 @@ from qsgm.train.graphs.layers import (
     declare_layers,
     gradient_before,
     through_activation,
+    weight_gradients,
 )
 from qsgm.train.graphs.loss import activate, loss_and_error
 from qsgm.train.graphs.sgm import (
@@ -28,10 +31,10 @@ from qsgm.train.graphs.sgm import (
     int8_sgm,
     scaled_inputs,
     sgm_inputs,
+    underflow_fraction,
 )
 from qsgm.train.graphs.step import forward_all, sgms_behind
 from qsgm.train.graspnet import Loss
-from qsgm.train.quantize import QuantizedSgm
 
 
 def probe_model(
@@ -44,8 +47,10 @@ def probe_model(
     """Gradients on every tuned layer's activation but the last one's, each sample's own.
 
     Inputs are those of :mod:`qsgm.train.graphs.step` without rates and moments. Outputs for every
-    SGM's layer k: `true{k}`, `float{k}`, `int8{k}`, each (B, P, C), and `clipped{k}`, the fraction
-    of the int8 SGM's inputs that lay outside its ranges.
+    SGM's layer k: `activation{k}`, `true{k}`, `float{k}`, `int8{k}`, each (B, P, C);
+    `update_true{k}` and so on, the gradients of the layer's weight and bias that these lead to,
+    each (C, K + 1), the bias's last, summed over the batch; and `clipped{k}`, the fraction of the
+    int8 SGM's inputs that lay outside its ranges.
 
     Raises:
         QsgmError: fewer than two layers are tuned, so that there is no SGM, or one is missing.
@@ -60,10 +65,11 @@ def probe_model(
     layers = declare_layers(graph, net, tuned)
     batch = declare_batch(graph, net, tuned)
     passes = forward_all(graph, layers, batch.features)
-    probe_truth(graph, layers, passes, batch, loss)
+    truth = probe_truth(graph, layers, passes, batch, loss)
     for layer, done in zip(layers[:-1], passes[:-1], strict=True):
         number = layer.number
-        probe_sgm(graph, layer, done, batch, float_sgms[number], int8_sgms[number])
+        given = probe_sgm(graph, layer, done, batch, float_sgms[number], int8_sgms[number])
+        probe_updates(graph, layer, done, {"true": truth[number], **given})
     return graph.model()
 
 
@@ -72,7 +78,7 @@ def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProt
     graph = Graph("head")
     layers = declare_layers(graph, net, tuned)
     op = graph.within("head")
-    features = as_seen(op, declare_features(graph, net, tuned), tuned)
+    features = as_seen(op, net, declare_features(graph, net, tuned), tuned)
     passes = forward_all(graph, layers, features)
     activated = activate(op, op.Squeeze(passes[-1].after, op.shape(1)), encoding)
     graph.output("outputs", op.Concat(*activated, axis=1), np.float32, ("crops", 3))
@@ -81,8 +87,9 @@ def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProt
 
 def probe_truth(
     graph: Graph, layers: list[TunedLayer], passes: list[Pass], batch: Batch, loss: Loss
-) -> None:
-    """Declare `true{k}` of every layer but the last."""
+) -> dict[int, Value]:
+    """Declare `true{k}` of every layer but the last; returns them by layer."""
+    truth = {}
     op = graph.within("truth")
     raw = op.Squeeze(passes[-1].after, op.shape(1))
     _, error = loss_and_error(op, loss, raw, batch.labels)
@@ -92,6 +99,8 @@ def probe_truth(
         gradient = gradient_before(op, layer, through_activation(op, layer, done, gradient))
         shape = "batch", before.after_side**2, before.channels
         graph.output(f"true{before.number}", gradient, np.float32, shape)
+        truth[before.number] = gradient
+    return truth
 
 
 def probe_sgm(
@@ -101,14 +110,32 @@ def probe_sgm(
     batch: Batch,
     float_one: FoldedSgm,
     int8_one: QuantizedSgm,
-) -> None:
-    """Declare `float{k}`, `int8{k}` and `clipped{k}` of one layer."""
+) -> dict[str, Value]:
+    """Declare `activation{k}`, `float{k}`, `int8{k}`, `clipped{k}` of a layer; both gradients."""
     number, side = layer.number, layer.after_side
     shape = "batch", side**2, layer.channels
     op = graph.within(f"layer{number}/float")
     seen = sgm_inputs(op, done.after, side, batch)
-    graph.output(f"float{number}", float_sgm(op, float_one, side, seen), np.float32, shape)
+    graph.output(f"activation{number}", done.after, np.float32, shape)
+    floating = float_sgm(op, float_one, side, seen)
+    graph.output(f"float{number}", floating, np.float32, shape)
     op = graph.within(f"layer{number}/int8")
-    graph.output(f"int8{number}", int8_sgm(op, int8_one, side, seen), np.float32, shape)
-    clipped = clipped_fraction(op, scaled_inputs(op, int8_one, seen))
+    int8 = int8_sgm(op, int8_one, side, seen)
+    graph.output(f"int8{number}", int8, np.float32, shape)
+    clipped = clipped_fraction(op, int8_one, scaled_inputs(op, int8_one, seen))
     graph.output(f"clipped{number}", clipped, np.float32, ())
+    underflow = underflow_fraction(op, int8_one, seen)
+    graph.output(f"underflow{number}", underflow, np.float32, ())
+    return {"float": floating, "int8": int8}
+
+
+def probe_updates(
+    graph: Graph, layer: TunedLayer, done: Pass, gradients: Mapping[str, Value]
+) -> None:
+    """Declare `update_true{k}` and so on: what a layer would make of each of its gradients."""
+    for name, gradient in gradients.items():
+        op = graph.within(f"layer{layer.number}/update_{name}")
+        d_weight, d_bias = weight_gradients(op, done, through_activation(op, layer, done, gradient))
+        update = op.Concat(d_weight, op.Unsqueeze(d_bias, op.shape(1)), axis=1)
+        shape = layer.channels, layer.width + 1
+        graph.output(f"update_{name}{layer.number}", update, np.float32, shape)
