@@ -36,7 +36,7 @@ def gradients(exact: str) -> dict[str, np.ndarray]:
     labels = np.zeros((CROPS, 3), np.float32)
     labels[::2] = 1.0, 0.6, 0.8
     feeds = {
-        "features": np.abs(rng.normal(size=(CROPS, 169, 16))).astype(np.float32),
+        "features": rng.integers(0, 256, (CROPS, 169, 16), dtype=np.uint8),
         "labels": labels,
         "rows": np.arange(CROPS),
     }

@@ -24,12 +24,12 @@ from torch.nn import functional as F
 from qsgm.angles import angle_error, decode_angle, mean_direction
 from qsgm.bundle import NETWORK, Bundle, load_bundle
 from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
-from qsgm.finetuning import SLICE
 from qsgm.images import read_demonstration
 from qsgm.train.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss, normalize
 from qsgm.tuning import BATCH, batches, rate_factor
 
 RATE = 1e-3  # Adam's, as the paper has it
+SLICE = 50  # crops at once
 
 
 def run(

@@ -10,6 +10,7 @@ gathering or scattering the windows' gradients.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import DTypeLike
 from onnx import TensorProto
 
 from qsgm.blocks import tuned_layers
@@ -104,17 +105,30 @@ def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]
 
 
 def declare_features(graph: Graph, net: FoldedNet, tuned: int) -> Value:
-    """Input of the first tuned layer, for all crops: (N, P, C), float32; of layer 1 the pixels."""
+    """Input of the first tuned layer, for all crops: (N, P, C), see :func:`features_dtype`."""
     number = tuned_layers(tuned)[0]
     shape = ("crops", input_side(net, number) ** 2, net.layers[number - 1].weight.shape[1])
-    return graph.input("features", np.uint8 if number == 1 else np.float32, shape)
+    return graph.input("features", features_dtype(net, number - 1), shape)
 
 
-def as_seen(op: Ops, features: Value, tuned: int) -> Value:
-    """Features as the first tuned layer sees them: pixels become float32 in [-1, 1]."""
-    if tuned_layers(tuned)[0] > 1:
+def features_dtype(net: FoldedNet, last_frozen: int) -> DTypeLike:
+    """uint8 for pixels, and for the output of a layer that has steps; else float32."""
+    return np.uint8 if last_frozen == 0 or last_frozen in net.feature_steps else np.float32
+
+
+def as_seen(op: Ops, net: FoldedNet, features: Value, tuned: int) -> Value:
+    """Features as the first tuned layer sees them: float32, pixels in [-1, 1]."""
+    number = tuned_layers(tuned)[0]
+    if features_dtype(net, number - 1) != np.uint8:
         return features
-    return normalized(op, op.Cast(features, to=TensorProto.FLOAT))
+    codes = op.Cast(features, to=TensorProto.FLOAT)
+    if number == 1:
+        return normalized(op, codes)
+    # DequantizeLinear with a step per channel would make a training step a fifth longer. This is
+    # as quick as float32 features: the runtime writes out steps for every position when it loads.
+    steps = net.feature_steps[number - 1]
+    positions = input_side(net, number) ** 2
+    return op.Mul(codes, op.Expand(op.constant(steps), op.shape(positions, len(steps))))
 
 
 def normalized(op: Ops, pixels: Value) -> Value:
@@ -129,7 +143,7 @@ def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
     share = op.Reciprocal(op.Cast(op.Size(rows), to=TensorProto.FLOAT))
-    seen = as_seen(op, op.Gather(features, rows, axis=0), tuned)
+    seen = as_seen(op, net, op.Gather(features, rows, axis=0), tuned)
     return Batch(seen, op.Gather(labels, rows, axis=0), share)
 
 
