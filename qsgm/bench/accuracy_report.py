@@ -18,6 +18,7 @@ from qsgm.bench.accuracy import (
     Runs,
 )
 from qsgm.bundle import Recipe
+from qsgm.finetuning import trunk_precision
 from qsgm.report import number, plain_table
 
 LEGEND = """means over frames after so many epochs (ep.); then the longest run's median and
@@ -34,6 +35,7 @@ def accuracy_report_json(report: AccuracyReport) -> dict[str, Any]:
     return {
         "bundle": str(report.bundle.folder),
         "layers": report.settings.layers,
+        "trunk": trunk_precision(report.settings, report.bundle),
         "epochs": report.settings.epochs,
         "seed": report.settings.seed,
         **{

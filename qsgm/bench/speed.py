@@ -22,7 +22,7 @@ from rich.console import Group, RenderableType
 from qsgm.bundle import Bundle, head_file
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import Prepared, Settings, Watch, prepare
+from qsgm.finetuning import Prepared, Settings, Watch, prepare, trunk_precision
 from qsgm.images import read_demonstration
 from qsgm.report import number, plain_table
 from qsgm.tuning import BATCH
@@ -59,6 +59,7 @@ def measure_speed(
         "frame": str(frame),
         "bundle": str(bundle.folder),
         "layers": settings.layers,
+        "trunk": trunk_precision(settings, bundle),
         "epochs": settings.epochs,
         "threads": settings.threads,
         "repeats": repeats,
@@ -105,7 +106,8 @@ def run_once(name: str, frame: Path, bundle: Bundle, settings: Settings) -> Seco
         else:
             job = ["qsgm.cli", "finetune", "--json", "-o", f"{home}/object", *VARIANTS[name]]
             job += ["--layers", layers, "--epochs", epochs, "--seed", seed, "--threads", threads]
-            job += ["--bundle", str(folder), "--", str(frame)]
+            job += ["--trunk", trunk_precision(settings, bundle), "--bundle", str(folder)]
+            job += ["--", str(frame)]
         began = time.perf_counter()
         done = subprocess.run(
             [sys.executable, "-m", *job],

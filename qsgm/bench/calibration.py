@@ -1,0 +1,402 @@
+"""What a calibration set is worth off its own kind: sets, calibrators and bits, judged elsewhere.
+
+Every set is taken from far to near: its ranges are taken along float fine-tuning runs on its own
+frames, its int8 SGMs then tune other frames, and their gradients and results are compared with the
+float SGMs' on the same crops. Nothing is exported: an SGM's constants are exchanged in the bundle's
+own graphs.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from qsgm.bench.frames import MANIFEST, BenchFrame, list_frames
+from qsgm.blocks import tuned_layers
+from qsgm.bundle import Bundle
+from qsgm.crops import TRAIN_CROPS
+from qsgm.errors import QsgmError
+from qsgm.finetuning import (
+    Exchanged,
+    FinetuneResult,
+    Prepared,
+    Settings,
+    Watch,
+    activations_before,
+    activations_of,
+    prepare,
+    sgm_blocks,
+    train,
+)
+from qsgm.folded import FloatArray, float_trace
+from qsgm.observers import SgmObservers
+from qsgm.quantize import (
+    ActivationBits,
+    SgmRanges,
+    WeightBits,
+    constants,
+    constants_of_two_planes,
+    quantize_sgm,
+)
+from qsgm.recalibration import GROWTH, grown, ranges_of
+from qsgm.report import number, plain_table
+from qsgm.tuning import BATCH
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Rows = NDArray[np.int64]
+Observed = Mapping[int, SgmObservers]
+
+# Of each run on a calibration frame: steps between two looks, crops looked at.
+OBSERVE_EVERY_STEPS = 25
+OBSERVED_CROPS = 256
+DARK = 0.25  # times the brightness
+PLAIN_TABLES = ("plain", "gradient")
+NOISE_FRAMES = 4
+OWN_RUN, OWN_CROPS = "the object itself", "its crops (--recalibrate)"
+# A frame has lost accuracy to quantization if it is off by more than runs differ anyway.
+LOST_DETECTION, LOST_ANGLE_DEG, LOST_ANGLE_SHARE = 0.01, 0.25, 0.15
+# of one run, in this order
+METRICS = (
+    "cos_int8_float",  # the lowest of any SGM, mean over the run
+    "cos_int8_true",  # mean over SGMs
+    "clipped_fraction",  # the highest of any SGM
+    "detection_accuracy",
+    "angle_mae_deg",
+    "warned",
+)
+COS_FLOAT, COS_TRUE, CLIPPED, DETECTION, ANGLE, WARNED = range(len(METRICS))
+LEGEND = """means over frames; cos: of int8 to float (and the worst frame's), to true gradients;
+clip: share of inputs outside their ranges, in %; angle: error in degrees, modulo
+180°; lost: share of frames worse than with float SGMs; warned: of frames"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How SGMs are quantized."""
+
+    activation_bits: ActivationBits
+    weight_bits: WeightBits
+    calibrator: str
+
+    def __str__(self) -> str:
+        return f"a{self.activation_bits} w{self.weight_bits} {self.calibrator}"
+
+
+# (layer, variant) -> what its SGM has to cover
+RangesOf = Callable[[int, Variant], SgmRanges]
+VARIANTS = (
+    Variant(16, 16, "minmax"),
+    Variant(8, 16, "minmax"),
+    Variant(8, 16, "percentile"),
+    Variant(8, 16, "mse"),
+    Variant(8, 16, "entropy"),
+    Variant(8, 8, "minmax"),
+    Variant(8, 6, "minmax"),
+    Variant(8, 4, "minmax"),
+)
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """One run per source of ranges, variant and frame."""
+
+    settings: Settings
+    bundle: Bundle
+    frames: tuple[BenchFrame, ...]
+    sources: tuple[str, ...]  # from far to near
+    variants: tuple[Variant, ...]
+    results: Floats  # (sources, variants, frames, METRICS)
+    floating: Floats  # (frames, METRICS), with the float SGMs
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which runs lost accuracy to quantization: (sources, variants, frames)."""
+        angle, reference = self.results[..., ANGLE], self.floating[:, ANGLE]
+        margin = np.maximum(LOST_ANGLE_DEG, LOST_ANGLE_SHARE * reference)
+        # A round object's angle means nothing.
+        judged = np.array([frame.elongated is not False for frame in self.frames])
+        missed = self.floating[:, DETECTION] - self.results[..., DETECTION] > LOST_DETECTION
+        return np.asarray(missed | (judged & (angle > reference + margin)))
+
+    @property
+    def elongated(self) -> NDArray[np.bool_]:
+        """Frames whose angle means something; all of them if nobody said."""
+        known = np.array([frame.elongated is True for frame in self.frames])
+        return known if known.any() else np.ones(len(self.frames), bool)
+
+    def watch_rates(self) -> dict[str, float | None]:
+        """How often the warning came where accuracy was lost, and where it was not."""
+        warned = self.results[..., WARNED] > 0
+        rates = {"warned_of_lost": warned[self.lost], "warned_of_kept": warned[~self.lost]}
+        counts = {"lost": int(self.lost.sum()), "kept": int((~self.lost).sum())}
+        shares = {
+            name: number(float(values.mean()), 4) if len(values) else None
+            for name, values in rates.items()
+        }
+        return {**shares, **counts}
+
+    def summary(self, source: int, variant: int) -> dict[str, float | None]:
+        """One row of the table."""
+        runs = self.results[source, variant]
+        return {
+            "cos_int8_float": number(runs[:, COS_FLOAT].mean(), 6),
+            "cos_int8_float_worst": number(runs[:, COS_FLOAT].min(), 6),
+            "cos_int8_true": number(runs[:, COS_TRUE].mean(), 4),
+            "clipped_fraction": number(runs[:, CLIPPED].mean(), 6),
+            "detection_accuracy": number(runs[:, DETECTION].mean(), 4),
+            "angle_mae_deg": number(runs[self.elongated, ANGLE].mean(), 3),
+            "lost": number(self.lost[source, variant].mean(), 4),
+            "warned": number(runs[:, WARNED].mean(), 4),
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        floating = self.floating
+        return {
+            "bundle": str(self.bundle.folder),
+            "layers": self.settings.layers,
+            "epochs": self.settings.epochs,
+            "seed": self.settings.seed,
+            "frames": [frame.name for frame in self.frames],
+            "float": {
+                "cos_float_true": number(floating[:, COS_TRUE].mean(), 4),
+                "detection_accuracy": number(floating[:, DETECTION].mean(), 4),
+                "angle_mae_deg": number(floating[self.elongated, ANGLE].mean(), 3),
+            },
+            "sources": {
+                source: {
+                    str(variant): self.summary(i, k)
+                    | {"per_frame": self.results[i, k].round(6).tolist()}
+                    for k, variant in enumerate(self.variants)
+                }
+                for i, source in enumerate(self.sources)
+            },
+            "watch": self.watch_rates(),
+        }
+
+    def render(self) -> RenderableType:
+        """A table per variant, its rows from far to near."""
+        floating = self.floating
+        title = Text(
+            f"float SGMs: cos to true {floating[:, COS_TRUE].mean():.3f}, detection"
+            f" {floating[:, DETECTION].mean():.3f}, angle"
+            f" {floating[self.elongated, ANGLE].mean():.2f}"
+        )
+        tables = [self._table(k) for k in range(len(self.variants))]
+        rates = ", ".join(f"{name} {value}" for name, value in self.watch_rates().items())
+        return Group(title, *tables, Text(f"watch: {rates}"), Text(LEGEND))
+
+    def _table(self, k: int) -> RenderableType:
+        table = plain_table(str(self.variants[k]))
+        table.add_column("calibrated on")
+        for heading in ("cos", "worst", "cos true", "clip", "detect", "angle", "lost", "warned"):
+            table.add_column(heading, justify="right")
+        for i, source in enumerate(self.sources):
+            row = {name: value or 0.0 for name, value in self.summary(i, k).items()}
+            table.add_row(
+                source,
+                f"{row['cos_int8_float']:.4f}",
+                f"{row['cos_int8_float_worst']:.4f}",
+                f"{row['cos_int8_true']:.3f}",
+                f"{100 * row['clipped_fraction']:.2f}",
+                f"{row['detection_accuracy']:.3f}",
+                f"{row['angle_mae_deg']:.2f}",
+                f"{row['lost']:.0%}",
+                f"{row['warned']:.0%}",
+            )
+        table.padding = 0
+        return table
+
+
+def measure_calibration(
+    frames: Sequence[BenchFrame],
+    calibration_folder: Path,
+    bundle: Bundle,
+    settings: Settings,
+    watch: Watch,
+    variants: Sequence[Variant] = VARIANTS,
+) -> CalibrationReport:
+    """Calibrate on every set, tune every frame with what comes of it.
+
+    Args:
+        frames: to judge on, one by one; none should be in the calibration sets.
+        calibration_folder: that the sets are made of.
+        bundle: whose SGMs are quantized; of 16 bit activations.
+        settings: of every run.
+        variants: calibrators and bits.
+        watch: told about progress.
+
+    Raises:
+        QsgmError: a frame cannot be used, the bundle's SGMs have another number of bits, or a run
+            diverged.
+    """
+    layers = tuned_layers(settings.layers)[:-1]
+    if any(bundle.activation_bits(layer) != 16 for layer in layers):
+        raise QsgmError(
+            f"the bundle {bundle.folder} holds SGMs with 8 bit activations, expected 16: other "
+            "calibrations do not fit its graphs; export it with `--activation-bits 16`"
+        )
+    sets = calibration_sets(calibration_folder)
+    sources = {}
+    for done, (name, images) in enumerate(sets.items()):
+        watch("calibrate", done, len(sets))
+        sources[name] = ranges_seen(observe_set(images, bundle, settings, layers))
+    watch("calibrate", len(sets), len(sets))
+    results, floating = [], []
+    for done, frame in enumerate(frames):
+        watch("judge", done, len(frames))
+        prepared = prepare(frame.read(), bundle, settings)
+        floating.append(metrics_of(train(prepared, replace(settings, precision="float"))))
+        own = own_sources(prepared, settings, layers)
+        results.append(judge(prepared, settings, [*sources.values(), *own.values()], variants))
+    watch("judge", len(frames), len(frames))
+    return CalibrationReport(
+        settings,
+        bundle,
+        tuple(frames),
+        (*sources, *own),
+        tuple(variants),
+        np.array(results).transpose(1, 2, 0, 3),
+        np.array(floating),
+    )
+
+
+def calibration_sets(folder: Path) -> dict[str, list[Image]]:
+    """Frames to calibrate on, by set, from the least like any other frame to the most."""
+    frames = list_frames(folder)
+    images = [frame.read() for frame in frames]
+    plain = [image for image, kind in zip(images, table_kinds(folder), strict=True) if kind]
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, images[0].shape, dtype=np.uint8) for _ in range(NOISE_FRAMES)]
+    return {
+        "random noise": noise,
+        "one dark object": [darkened(images[0])],
+        "all of them, dark": [darkened(image) for image in images],
+        "one object": images[:1],
+        **({"plain tables only": plain} if plain else {}),
+        f"{len(images)} mixed frames": images,
+    }
+
+
+def darkened(image: Image) -> Image:
+    """The same frame in little light."""
+    return (DARK * image).astype(np.uint8)
+
+
+def table_kinds(folder: Path) -> list[bool]:
+    """Of each frame, whether the manifest says that its table is a plain one."""
+    path = folder / MANIFEST
+    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    entries = entries.get("frames", []) if isinstance(entries, dict) else entries
+    kinds = [entry.get("table_kind") in PLAIN_TABLES for entry in entries]
+    return kinds or [False] * len(list_frames(folder))
+
+
+def observe_set(
+    images: Sequence[Image], bundle: Bundle, settings: Settings, layers: Sequence[int]
+) -> Observed:
+    """What each SGM sees in float runs on some frames; one is in memory at a time."""
+    total = {layer: SgmObservers(bundle.float_sgm(layer)) for layer in layers}
+    for image in images:
+        prepared = prepare(image, bundle, settings)
+        for layer, observers in observe_run(prepared, settings, layers).items():
+            total[layer].merge(observers)
+    return total
+
+
+def observe_run(prepared: Prepared, settings: Settings, layers: Sequence[int]) -> Observed:
+    """What each SGM sees in one float run, every now and then on some of the crops."""
+    steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
+    floating = replace(settings, precision="float")
+    run = train(prepared, floating, probe=False, keep=range(0, steps + 1, OBSERVE_EVERY_STEPS))
+    rng = np.random.default_rng([settings.seed, 3])
+    sgms = {layer: prepared.bundle.float_sgm(layer) for layer in layers}
+    observers = {layer: SgmObservers(sgm) for layer, sgm in sgms.items()}
+    for weights in run.kept.values():
+        rows = rng.choice(TRAIN_CROPS, OBSERVED_CROPS, replace=False)
+        for layer, seen in seen_by_sgms(prepared, settings, weights, rows).items():
+            observers[layer].update(seen, float_trace(sgms[layer], seen)[1])
+    return observers
+
+
+def seen_by_sgms(
+    prepared: Prepared, settings: Settings, weights: Mapping[str, FloatArray], rows: Rows
+) -> dict[int, FloatArray]:
+    """By layer, activation and label (B, P, Ci) of the crops `rows` with these weights."""
+    activations = activations_of(prepared, settings, weights, rows)
+    labels = prepared.labels[rows][:, None]  # (B, 1, 3)
+    return {
+        layer: np.concatenate([x, np.repeat(labels, x.shape[1], axis=1)], axis=2)
+        for layer, x in activations.items()
+    }
+
+
+def ranges_seen(observed: Observed) -> RangesOf:
+    """Ranges by what was observed along runs."""
+
+    def ranges(layer: int, variant: Variant) -> SgmRanges:
+        return observed[layer].ranges(variant.calibrator, 2**variant.activation_bits)
+
+    return ranges
+
+
+def own_sources(
+    prepared: Prepared, settings: Settings, layers: Sequence[int]
+) -> dict[str, RangesOf]:
+    """The nearest there is: a run on the very object, and its crops before any run."""
+    activations = activations_before(prepared, settings)
+    sgms = {layer: prepared.bundle.float_sgm(layer) for layer in layers}
+    crops = {layer: ranges_of(sgm, activations[layer]) for layer, sgm in sgms.items()}
+
+    def ranges(layer: int, variant: Variant) -> SgmRanges:
+        return grown(crops[layer], GROWTH[variant.activation_bits])
+
+    return {OWN_RUN: ranges_seen(observe_run(prepared, settings, layers)), OWN_CROPS: ranges}
+
+
+def judge(
+    prepared: Prepared,
+    settings: Settings,
+    sources: Sequence[RangesOf],
+    variants: Sequence[Variant],
+) -> list[list[list[float]]]:
+    """Metrics of one run per source and variant on one frame."""
+    return [
+        [
+            metrics_of(train(prepared, settings, exchanged=exchange(prepared, settings, *one)))
+            for one in product([ranges], variants)
+        ]
+        for ranges in sources
+    ]
+
+
+def exchange(
+    prepared: Prepared, settings: Settings, ranges: RangesOf, variant: Variant
+) -> Exchanged:
+    """Constants for the bundle's graphs: its SGMs, quantized in another way."""
+    exchanged = {}
+    for layer in sgm_blocks(settings).sgm_layers:
+        bits = variant.activation_bits, variant.weight_bits
+        q = quantize_sgm(prepared.bundle.float_sgm(layer), ranges(layer, variant), *bits)
+        exchanged[layer] = constants(q) if q.bits == 16 else constants_of_two_planes(q)
+    return exchanged
+
+
+def metrics_of(result: FinetuneResult) -> list[float]:
+    """One run's, in the order of :data:`METRICS`."""
+    layers = result.fidelity.values()
+    return [
+        min(layer.cos_int8_float for layer in layers),
+        float(np.mean([layer.cos_int8_true for layer in layers])),
+        max(layer.clipped_fraction for layer in layers),
+        result.accuracy.detection_accuracy,
+        result.accuracy.angle_mae_deg,
+        float(bool(result.warnings)),
+    ]

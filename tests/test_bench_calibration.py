@@ -1,0 +1,177 @@
+"""The calibration study: every set's ranges tune other frames, and losses are counted right."""
+
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from qsgm import QsgmError, cli
+from qsgm.bench.calibration import (
+    ANGLE,
+    CLIPPED,
+    COS_FLOAT,
+    DETECTION,
+    METRICS,
+    OWN_CROPS,
+    OWN_RUN,
+    WARNED,
+    CalibrationReport,
+    Variant,
+    calibration_sets,
+    darkened,
+    exchange,
+    measure_calibration,
+    observe_run,
+    ranges_seen,
+)
+from qsgm.bench.frames import BenchFrame, list_frames
+from qsgm.bundle import Bundle, load_bundle
+from qsgm.finetuning import Settings, prepare, train
+from qsgm.folded import float_trace
+from qsgm.train.calibration_chart import write_calibration_chart
+from tests.conftest import draw_frame
+
+SHORT = Settings(epochs=1)
+TWO = (Variant(16, 16, "minmax"), Variant(8, 8, "percentile"))
+
+
+@pytest.fixture(scope="module")
+def report(frames_folder: Path, bundle: Bundle) -> CalibrationReport:
+    """Calibrated and judged on the same two frames; only the study itself would object."""
+    frames = list_frames(frames_folder)
+    return measure_calibration(frames, frames_folder, bundle, SHORT, lambda *_: None, TWO)
+
+
+def made_up(results: np.ndarray, floating: np.ndarray, bundle: Bundle) -> CalibrationReport:
+    frames = tuple(
+        BenchFrame(Path(f"{i}.png"), None, elongated) for i, elongated in enumerate((True, False))
+    )
+    return CalibrationReport(SHORT, bundle, frames, ("far", "near"), TWO, results, floating)
+
+
+def test_every_set_and_variant_is_judged_on_every_frame(report: CalibrationReport) -> None:
+    assert report.results.shape == (len(report.sources), 2, 2, len(METRICS))
+    assert report.sources[-2:] == (OWN_RUN, OWN_CROPS)
+    assert "random noise" in report.sources
+    assert (np.abs(report.results[..., COS_FLOAT]) <= 1).all()
+    assert (report.floating[:, COS_FLOAT] > 0.99).all()
+
+
+def test_ranges_of_the_very_object_leave_16_bits_nothing_to_clip(report: CalibrationReport) -> None:
+    own = report.results[-2:, 0]
+    assert (own[..., CLIPPED] == 0).all()
+    assert (own[..., COS_FLOAT] > 0.999).all()
+
+
+def test_a_run_is_observed_from_its_first_step_to_its_last(bundle: Bundle) -> None:
+    prepared = prepare(draw_frame()[0], bundle, SHORT)
+    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))(4, TWO[0])
+    steps = 25
+    run = train(prepared, Settings(epochs=1, precision="float"), probe=False, keep=(0, steps))
+    assert len(run.kept) == 2
+    seen = prepared.features[:800]
+    assert ranges.input_high.shape == (19,)
+    assert len(seen) == 800
+    # Every hidden channel's span is what the float SGM makes of inputs inside the inputs' span.
+    sgm = bundle.float_sgm(4)
+    middle = ((ranges.input_low + ranges.input_high) / 2)[None, None].astype(np.float32)
+    for high, tensor in zip(ranges.hidden_high, float_trace(sgm, middle)[1], strict=True):
+        assert high.shape == tensor.shape[2:]
+
+
+def test_an_exchanged_variant_gives_what_a_bundle_calibrated_so_would_give(bundle: Bundle) -> None:
+    prepared = prepare(draw_frame()[0], bundle, SHORT)
+    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
+    variants = Variant(8, 4, "mse"), TWO[0]
+    coarse, fine = (
+        train(prepared, SHORT, exchanged=exchange(prepared, SHORT, ranges, variant))
+        for variant in variants
+    )
+    for layer in (4, 5):
+        assert fine.fidelity[layer].cos_int8_float > 0.9999
+        assert 0.5 < coarse.fidelity[layer].cos_int8_float < 0.999
+
+
+def test_a_loss_is_a_missed_crop_in_a_hundred_or_an_angle_beyond_what_runs_differ_by(
+    bundle: Bundle,
+) -> None:
+    floating = np.zeros((2, len(METRICS)))
+    floating[:, DETECTION], floating[:, ANGLE] = 0.99, [1.0, 40.0]
+    results = np.tile(floating, (2, 2, 1, 1))
+    results[0, 0, 0, DETECTION] = 0.975  # lost: more than a hundredth
+    results[0, 1, 0, ANGLE] = 1.2  # kept: less than a quarter of a degree
+    results[1, 0, 0, ANGLE] = 1.3  # lost
+    results[1, 1, 1, ANGLE] = 90  # kept: a round object has no angle
+    results[0, 0, 0, WARNED] = results[1, 1, 1, WARNED] = 1
+    report = made_up(results, floating, bundle)
+    assert np.argwhere(report.lost).tolist() == [[0, 0, 0], [1, 0, 0]]
+    rates = report.watch_rates()
+    assert (rates["lost"], rates["kept"]) == (2, 6)
+    assert rates["warned_of_lost"] == pytest.approx(1 / 2)
+    assert rates["warned_of_kept"] == pytest.approx(1 / 6, abs=1e-4)
+    assert report.elongated.tolist() == [True, False]
+
+
+def test_sets_go_from_noise_to_the_whole_set(frames_folder: Path) -> None:
+    sets = calibration_sets(frames_folder)
+    names = list(sets)
+    assert names[0] == "random noise"
+    assert names[-1] == "2 mixed frames"
+    assert "plain tables only" not in names  # nobody said which tables are plain
+    frame = draw_frame()[0]
+    assert darkened(frame).mean() < 0.3 * frame.mean()
+
+
+def test_plain_tables_are_those_that_the_manifest_calls_so(tmp_path: Path) -> None:
+    entries = []
+    for i, kind in enumerate(("plain", "planks", "gradient")):
+        frame = np.full((300, 300, 3), 50 + 50 * i, np.uint8)
+        frame[100:200, 100:200] //= 2
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
+        entries.append({"file": f"{i}.png", "table_kind": kind})
+    (tmp_path / "manifest.json").write_text(json.dumps({"frames": entries}))
+    plain = calibration_sets(tmp_path)["plain tables only"]
+    assert [int(image.max()) for image in plain] == [50, 150]
+
+
+def test_a_bundle_of_8_bit_activations_is_refused(bundle_folder: Path, bundle: Bundle) -> None:
+    loaded = load_bundle(bundle_folder)
+    loaded.manifest["sgms"]["5"]["bits"] = 8
+    with pytest.raises(QsgmError, match="8 bit activations, expected 16"):
+        measure_calibration([], bundle_folder, loaded, SHORT, lambda *_: None)
+    assert bundle.activation_bits(5) == 16
+
+
+def test_the_tables_fit_into_80_columns_and_the_json_holds_every_run(
+    report: CalibrationReport,
+) -> None:
+    console = Console(width=80, file=io.StringIO(), force_terminal=False)
+    console.print(report.render())
+    assert isinstance(console.file, io.StringIO)
+    shown = console.file.getvalue()
+    assert "…" not in shown
+    assert all(str(variant) in shown for variant in TWO)
+    values = json.loads(json.dumps(report.to_json(), allow_nan=False))
+    row = values["sources"][OWN_RUN][str(TWO[0])]
+    assert len(row["per_frame"]) == 2
+    assert row["cos_int8_float"] > 0.999
+
+
+def test_the_study_is_drawn(report: CalibrationReport, tmp_path: Path) -> None:
+    write_calibration_chart(report, tmp_path / "study.png")
+    picture = cv2.imread(str(tmp_path / "study.png"))
+    assert picture is not None
+    assert picture.shape[1] == 1800
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_a_folder_without_frames_is_refused_before_any_work(
+    tmp_path: Path, bundle_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["bench", "calibration", "--frames", str(tmp_path), "--bundle", str(bundle_folder)]
+    assert cli.run(arguments) == 1
+    assert capsys.readouterr().err.count("\n") == 1
