@@ -8,6 +8,7 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -28,7 +29,7 @@ from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
     from qsgm.blocks import Blocks
-    from qsgm.bundle import Bundle
+    from qsgm.bundle import Bundle, Precision
     from qsgm.finetuning import FinetuneResult, Settings
 
 EXIT_BAD_INPUT = 1
@@ -58,11 +59,35 @@ class OptimizerChoice(StrEnum):
     ADAM = "adam"
 
 
+class TrunkChoice(StrEnum):
+    """How the frozen layers are computed."""
+
+    INT8 = "int8"
+    FLOAT = "float"
+
+
 class Encoding(StrEnum):
     """What the two angle channels stand for."""
 
     DOUBLE = "double"
     PAPER = "paper"
+
+
+class CalibratorName(StrEnum):
+    """Whose ranges int8 SGMs get."""
+
+    AUTO = "auto"
+    MINMAX = "minmax"
+    PERCENTILE = "percentile"
+    MSE = "mse"
+    ENTROPY = "entropy"
+
+
+class ActivationBitsChoice(StrEnum):
+    """Of int8 SGMs' inputs and hidden tensors."""
+
+    EIGHT = "8"
+    SIXTEEN = "16"
 
 
 class Device(StrEnum):
@@ -103,6 +128,12 @@ BlocksOption = Annotated[
         metavar="A-B,C",
         help="Groups of the last layers that share one gradient, such as 1-4,5,6; default: none.",
     ),
+]
+TrunkOption = Annotated[
+    TrunkChoice | None, typer.Option(help="Precision of the frozen layers; default: the bundle's.")
+]
+RecalibrateOption = Annotated[
+    bool, typer.Option("--recalibrate", help="Fit the int8 SGMs' ranges to this object's crops.")
 ]
 OptimizerOption = Annotated[
     OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
@@ -204,6 +235,13 @@ def fold_and_quantize(
         list[str] | None,
         typer.Option(metavar="A-B,C", help="Also export steps for these blocks; repeatable."),
     ] = None,
+    calibrator: Annotated[
+        CalibratorName,
+        typer.Option(help="Whose ranges; auto: each SGM's best one on held-out frames."),
+    ] = CalibratorName.AUTO,
+    activation_bits: Annotated[
+        ActivationBitsChoice, typer.Option(help="Of the int8 SGMs: one u8 plane, or two.")
+    ] = ActivationBitsChoice.SIXTEEN,
     as_json: JsonOption = False,
 ) -> None:
     """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
@@ -211,7 +249,15 @@ def fold_and_quantize(
     host = _host_module("qsgm.train.export")
     calibration = paths.calibration_folder(calib)
     with _progress() as watch:
-        report = host.fold_and_quantize(checkpoint, calibration, output, watch, blocks=more)
+        report = host.fold_and_quantize(
+            checkpoint,
+            calibration,
+            output,
+            watch,
+            blocks=more,
+            calibrator=calibrator.value,
+            activation_bits=int(activation_bits.value),
+        )
     _show(report.to_json(), report, as_json)
 
 
@@ -230,8 +276,10 @@ def finetune(
         ),
     ] = None,
     blocks: BlocksOption = None,
+    trunk: TrunkOption = None,
     optimizer: OptimizerOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
+    recalibrate: RecalibrateOption = False,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
@@ -248,7 +296,10 @@ def finetune(
     from qsgm.tuned import DESCRIPTION
 
     tuned = _tuned(layers, blocks)
-    settings = _settings(int8, method, tuned, optimizer, epochs, seed, center, threads, blocks)
+    settings = _settings(
+        int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
+    )
+    settings = replace(settings, recalibrate=recalibrate)
     folder = paths.object_folder(frame) if output is None else output
     check_replaceable(folder, DESCRIPTION)
     result = _finetune(frame, _bundle(bundle), settings)
@@ -299,29 +350,50 @@ def fidelity(
     layers: Annotated[
         int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
     ] = defaults.LAYERS,
+    trunk: TrunkOption = None,
     optimizer: OptimizerOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
+    every: Annotated[
+        int, typer.Option(min=1, help="Steps from one probe to the next; 25 are an epoch.")
+    ] = defaults.PROBE_EVERY,
     output: ReportOption = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the metrics over the run, a PNG (matplotlib)."),
+    ] = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
-    from qsgm.report import fidelity_command_json, fidelity_report
+    from qsgm.report import fidelity_command_json, fidelity_command_report
 
-    settings = _settings(int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads)
-    result = _finetune(frame, _bundle(bundle), settings)
+    chart = None if picture is None else _host_module("qsgm.train.fidelity_chart")
+    settings = _settings(
+        int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads, trunk=trunk
+    )
+    result = _finetune(frame, _bundle(bundle), replace(settings, probe_every=every))
+    if not result.probes:
+        raise QsgmError(
+            f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
+            "there is nothing to compare; export it again with `qsgm fold-and-quantize`"
+        )
     report = fidelity_command_json(result, frame.stem)
+    if picture is not None and chart is not None:
+        chart.write_fidelity_chart(result, frame.stem, picture)
     _write_report(report, output)
-    _show(report, fidelity_report(result), as_json)
+    _show(report, fidelity_command_report(result), as_json)
+    if picture is not None and not as_json:
+        typer.echo(f"picture: {picture}")
 
 
 @bench.command("accuracy")
 def bench_accuracy(
     frames: FramesOption = None,
     layers: LayersOption = defaults.LAYERS,
+    trunk: TrunkOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
     short: Annotated[
         str, typer.Option(metavar="N,N", help="Epochs of further, shorter runs; '' for none.")
@@ -352,7 +424,9 @@ def bench_accuracy(
     charts = None if pictures is None else _host_module("qsgm.train.charts")
     lengths = _run_lengths(short)
     some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
-    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    settings = Settings(
+        layers=layers, trunk=_value(trunk), epochs=epochs, seed=seed, threads=threads
+    )
     with _progress() as watch:
         report = measure_accuracy(some, _bundle(bundle), settings, lengths, watch)
     values = accuracy_report_json(report)
@@ -430,6 +504,7 @@ def bench_scenes(
 def bench_speed(
     frames: FramesOption = None,
     layers: LayersOption = defaults.LAYERS,
+    trunk: TrunkOption = None,
     epochs: Annotated[
         int, typer.Option(min=1, max=10_000, help="Passes over 800 crops.")
     ] = defaults.EPOCHS,
@@ -446,11 +521,74 @@ def bench_speed(
     from qsgm.finetuning import Settings
 
     frame = list_frames(paths.calibration_folder() if frames is None else frames, 1)[0].path
-    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    settings = Settings(
+        layers=layers, trunk=_value(trunk), epochs=epochs, seed=seed, threads=threads
+    )
     with _progress() as watch:
         report = measure_speed(frame, _bundle(bundle), settings, repeats, watch)
     _write_report(report, output)
     _show(report, render(report), as_json)
+
+
+@bench.command("fidelity")
+def bench_fidelity(
+    frames: FramesOption = None,
+    layers: Annotated[
+        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
+    ] = defaults.LAYERS,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """int8 gradients against float and true ones along a run on every frame, worst cases named."""
+    from qsgm.bench.fidelity import measure_fidelity
+    from qsgm.bench.frames import list_frames
+    from qsgm.finetuning import Settings
+
+    some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
+    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    with _progress() as watch:
+        report = measure_fidelity(some, _bundle(bundle), settings, watch)
+    _write_report(report.to_json(), output)
+    _show(report.to_json(), report.render(), as_json)
+
+
+@bench.command("calibration")
+def bench_calibration(
+    frames: FramesOption = None,
+    calib: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
+    ] = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the study, a PNG (matplotlib).")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
+    from qsgm.bench.calibration import measure_calibration
+    from qsgm.bench.frames import list_frames
+    from qsgm.finetuning import Settings
+
+    chart = None if picture is None else _host_module("qsgm.train.calibration_chart")
+    folder = paths.calibration_folder(calib)
+    some = list_frames(folder if frames is None else frames, limit)
+    settings = Settings(epochs=epochs, seed=seed, threads=threads)
+    with _progress() as watch:
+        report = measure_calibration(some, folder, _bundle(bundle), settings, watch)
+    _write_report(report.to_json(), output)
+    if picture is not None and chart is not None:
+        chart.write_calibration_chart(report, picture)
+    _show(report.to_json(), report.render(), as_json)
 
 
 @bench.command("baselines")
@@ -579,6 +717,7 @@ def _settings(
     center: str | None,
     threads: int,
     blocks: str | None = None,
+    trunk: TrunkChoice | None = None,
 ) -> "Settings":
     from qsgm.finetuning import Settings
 
@@ -589,12 +728,17 @@ def _settings(
         precision="float" if int8 is False or method is MethodName.BP else "int8",
         layers=layers,
         blocks=blocks,
+        trunk=_value(trunk),
         optimizer=None if optimizer is None else optimizer.value,
         epochs=epochs,
         seed=seed,
         center_px=_center(center),
         threads=threads,
     )
+
+
+def _value(trunk: TrunkChoice | None) -> "Precision | None":
+    return None if trunk is None else trunk.value
 
 
 def _tuned(layers: int | None, blocks: str | None) -> int:

@@ -13,6 +13,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from qsgm import defaults
 from qsgm.angles import angle_error, decode_angle, mean_direction
-from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
+from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import (
     COMMAND,
     Bundle,
@@ -34,8 +36,10 @@ from qsgm.bundle import (
     trunk_file,
 )
 from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
+from qsgm.drift import drift_warnings
 from qsgm.errors import QsgmError
 from qsgm.fidelity import PROBED, LayerFidelity, compare_probe, mean_over_run
+from qsgm.recalibration import recalibrated
 from qsgm.report import run_json
 from qsgm.runtime import running
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
@@ -45,12 +49,16 @@ from qsgm.weights import to_conv_layout, to_step_layout
 Array = NDArray[np.float32]
 # (stage, how much of it is done, out of how much)
 Watch = Callable[[str, int, int], None]
+# Constants of int8 SGMs: by layer, by initializer name.
+Exchanged = Mapping[int, Mapping[str, NDArray[Any]]]
 
-# Crops that are in memory at once.
-SLICE = 50
+# Crops that are in memory at once. With more the frozen layers in float take much of it, and are no
+# quicker.
+SLICE = 10
+STEPS_PER_EPOCH = -(-TRAIN_CROPS // BATCH)
 DETECTION_THRESHOLD = 0.5
-# More of an SGM's inputs than this outside its ranges: the object is unlike the calibration set.
-NOTABLE_CLIPPING = 0.01
+# Crops whose activations an int8 SGM is calibrated on anew: where they are vectors, and maps.
+RECALIBRATION_CROPS, RECALIBRATION_MAPS = 400, 16
 # What each layer leaves per crop: convolution and ReLU, and the pool's one position.
 OUTPUTS_PER_CROP = {
     1: 8 * 2 * 62**2,
@@ -70,11 +78,14 @@ class Settings:
     precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
     layers: int = defaults.LAYERS  # how many of the last ones
     blocks: str | None = None  # those layers in groups, such as 4,5-6; None: each on its own
+    trunk: Precision | None = None  # of the frozen layers
     optimizer: OptimizerName | None = None
     epochs: int = defaults.EPOCHS
+    recalibrate: bool = False  # the int8 SGMs, on this object's crops before the first step
     seed: int = 0
     center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
     threads: int = 1
+    probe_every: int = defaults.PROBE_EVERY  # steps from one look at the gradients to the next
 
 
 @dataclass(frozen=True)
@@ -87,10 +98,15 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Probe:
-    """What the gradients were worth before the first step (epoch 0) or after an epoch."""
+    """What the gradients were worth after so many steps (0: before the first one)."""
 
-    epoch: int
+    step: int
     layers: dict[int, LayerFidelity]  # by SGM layer
+
+    @property
+    def epoch(self) -> float:
+        """Passes over the crops that the steps make."""
+        return self.step / STEPS_PER_EPOCH
 
 
 @dataclass(frozen=True)
@@ -128,12 +144,17 @@ class FinetuneResult:
     @property
     def steps(self) -> int:
         """How many there were."""
-        return self.settings.epochs * -(-TRAIN_CROPS // BATCH)
+        return self.settings.epochs * STEPS_PER_EPOCH
 
     @property
     def zero_shot(self) -> Accuracy:
         """The same crops, by the untouched network."""
         return self.prepared.zero_shot
+
+    @property
+    def trunk(self) -> Precision:
+        """Of the frozen layers."""
+        return trunk_precision(self.prepared.settings, self.prepared.bundle)
 
     @property
     def fidelity(self) -> dict[int, LayerFidelity]:
@@ -235,8 +256,8 @@ def prepare(
 ) -> Prepared:
     """Crops, features, labels and what the untouched network makes of them.
 
-    Of the settings only `layers`, `seed`, `center_px` and `threads` matter here; the others are
-    checked.
+    Of the settings only `layers`, `trunk`, `seed`, `center_px` and `threads` matter here; the
+    others are checked.
     """
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
@@ -279,7 +300,8 @@ def see(
     watch: Watch,
 ) -> Features:
     """Features (N, P, C) of the planned crops, cut slice by slice: they never all exist."""
-    session = bundle.session(trunk_file(settings.layers), settings.threads)
+    name = trunk_file(trunk_precision(settings, bundle), settings.layers)
+    session = bundle.session(name, settings.threads)
     features: Features | None = None
     for first in range(0, len(plan), SLICE):
         rows = slice(first, min(first + SLICE, len(plan)))
@@ -294,6 +316,11 @@ def see(
         watch("crops", rows.stop, len(plan))
     assert features is not None, "a plan has at least one crop"
     return features
+
+
+def trunk_precision(settings: Settings, bundle: Bundle) -> Precision:
+    """Of the frozen layers: the settings' or, where they have none, the bundle's."""
+    return settings.trunk or bundle.trunk
 
 
 def answers(
@@ -330,17 +357,20 @@ def train(
     probe: bool = True,
     recipe: Recipe | None = None,
     keep: Collection[int] = (),
+    exchanged: Exchanged = MappingProxyType({}),
 ) -> FinetuneResult:
     """One run of one method on a prepared demonstration; what was prepared stays as it is.
 
     Args:
         prepared: as :func:`prepare` returned it.
         settings: may differ from those it was prepared with in `method`, `precision`, `blocks`,
-            `optimizer`, `epochs` and `threads`.
+            `optimizer`, `epochs`, `threads` and `probe_every`.
         watch: told about every epoch.
         probe: whether to measure the gradients' fidelity.
         recipe: optimizer and rates; None: the bundle's for these settings.
         keep: steps after which the weights are kept (0: before the first).
+        exchanged: constants of int8 SGMs in the place of the bundle's; see
+            :mod:`qsgm.recalibration`, which gives them where the settings say `recalibrate`.
 
     Raises:
         QsgmError: training diverged, or the bundle lacks the method.
@@ -354,8 +384,10 @@ def train(
     blocks = run_blocks(settings)
     bundle.check_blocks(blocks)
     recipe = recipe or bundle.recipe(settings.method, layers, settings.optimizer, blocks)
-    loop = _GuardedLoop(prepared, settings, recipe, keep)
-    prober = _Prober(prepared, settings, probe)
+    if settings.recalibrate:
+        exchanged = recalibrated(bundle, activations_before(prepared, settings))
+    prober = _Prober(prepared, settings, probe, exchanged)
+    loop = _GuardedLoop(prepared, settings, recipe, keep, prober, exchanged)
     losses, tuning = _run_epochs(loop, prober, settings, watch or _ignore)
     weights = loop.weights()
     accuracy = validate(prepared, weights, settings)
@@ -372,7 +404,8 @@ def train(
         seconds,
         kept=loop.kept,
     )
-    return replace(result, warnings=drift_warnings(result))
+    int8 = (settings.method, settings.precision) == ("sgm", "int8")
+    return replace(result, warnings=drift_warnings(result.fidelity) if int8 else ())
 
 
 def _run_epochs(
@@ -383,12 +416,9 @@ def _run_epochs(
 
     def after_epoch(epoch: int, loss: float) -> None:
         losses.append(loss)
-        weights = loop.weights()
-        loop.refuse_unless_finite(all(np.isfinite(w).all() for w in weights.values()), "a weight")
-        prober(epoch, weights)
+        loop.finite_weights()
         watch("tuning", epoch, settings.epochs)
 
-    prober(0, loop.weights())
     began, probing = time.perf_counter(), prober.seconds
     # Methods with the same seed see the same batches in the same order.
     tune(loop, TRAIN_CROPS, settings.epochs, np.random.default_rng([settings.seed, 1]), after_epoch)
@@ -402,21 +432,40 @@ def validate(prepared: Prepared, weights: Mapping[str, Array], settings: Setting
     return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
 
 
+def activations_before(prepared: Prepared, settings: Settings) -> dict[int, Array]:
+    """What the layers in front of SGMs give on some training crops before any step, (N, P, C)."""
+    count = RECALIBRATION_CROPS if settings.layers <= defaults.LAYERS else RECALIBRATION_MAPS
+    return activations_of(prepared, settings, prepared.start, np.arange(count))
+
+
+def activations_of(
+    prepared: Prepared, settings: Settings, weights: Mapping[str, Array], rows: NDArray[np.int64]
+) -> dict[int, Array]:
+    """What the layers in front of SGMs give on the crops `rows` with these weights, (B, P, C)."""
+    layers, bundle = sgm_blocks(settings).sgm_layers, prepared.bundle
+    feeds = {"features": prepared.features, "labels": prepared.labels, "rows": rows, **weights}
+    session = bundle.session(probe_file(settings.layers), settings.threads)
+    names = [f"activation{layer}" for layer in layers]
+    with running_graphs(bundle):
+        values = session.run(names, feeds, only_what_is_asked())
+    return dict(zip(layers, values, strict=True))
+
+
+def constants_of(exchanged: Exchanged, layers: Collection[int]) -> dict[str, NDArray[Any]]:
+    """Those of the SGMs behind `layers`, by initializer name."""
+    return {name: array for layer in layers for name, array in exchanged.get(layer, {}).items()}
+
+
+def only_what_is_asked() -> ort.RunOptions:
+    """Nothing is computed that the outputs asked for do not need."""
+    options = ort.RunOptions()
+    options.only_execute_path_to_fetches = True
+    return options
+
+
 def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:
     """Around every run of a bundle's graph: they are checked when loaded, not for what they do."""
     return running(f"the bundle {bundle.folder}", f"export it again with `{COMMAND}`")
-
-
-def drift_warnings(result: FinetuneResult) -> tuple[str, ...]:
-    """One line for every SGM that saw much beyond its calibrated ranges."""
-    if (result.settings.method, result.settings.precision) != ("sgm", "int8"):
-        return ()
-    return tuple(
-        f"layer {k}: {100 * layer.clipped_fraction:.1f} % of what its int8 SGM saw lies outside "
-        f"the calibrated ranges: this object is unlike the calibration set; compare with --float"
-        for k, layer in result.fidelity.items()
-        if layer.clipped_fraction > NOTABLE_CLIPPING
-    )
 
 
 def peak_activation_bytes(blocks: Blocks, batch: int = BATCH) -> dict[str, int]:
@@ -433,31 +482,43 @@ def peak_activation_bytes(blocks: Blocks, batch: int = BATCH) -> dict[str, int]:
 
 
 class _GuardedLoop(StepLoop):
-    """Stops at the first step that leaves the realm of numbers; keeps weights on the way."""
+    """Stops at the first step that leaves the realm of numbers; keeps and probes on the way."""
 
     def __init__(
-        self, prepared: Prepared, settings: Settings, recipe: Recipe, keep: Collection[int]
+        self,
+        prepared: Prepared,
+        settings: Settings,
+        recipe: Recipe,
+        keep: Collection[int],
+        prober: "_Prober",
+        exchanged: Exchanged,
     ) -> None:
         bundle, blocks = prepared.bundle, run_blocks(settings)
         name = step_file(settings.precision, recipe.optimizer, blocks)
-        session = bundle.session(name, settings.threads)
-        steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
+        int8_layers = blocks.sgm_layers if settings.precision == "int8" else ()
+        session = bundle.session(name, settings.threads, constants_of(exchanged, int8_layers))
+        steps = settings.epochs * STEPS_PER_EPOCH
         rates = dict(zip(blocks.layers, recipe.rates_over(steps), strict=True))
         self.steps = 0
         self._bundle = bundle
         with running_graphs(bundle):
             super().__init__(session, prepared.features, prepared.labels, prepared.start, rates)
-        self._keep = keep
+        self._keep, self._prober = keep, prober
         self.kept: dict[int, dict[str, Array]] = {}
-        self._keep_weights()
+        self._look()
 
     def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
         with running_graphs(self._bundle):
             loss = super().step(rows, factor)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
-        self._keep_weights()
+        self._look()
         return loss
+
+    def finite_weights(self) -> dict[str, Array]:
+        weights = self.weights()
+        self.refuse_unless_finite(all(np.isfinite(w).all() for w in weights.values()), "a weight")
+        return weights
 
     def refuse_unless_finite(self, finite: bool, what: str) -> None:
         if not finite:
@@ -466,40 +527,59 @@ class _GuardedLoop(StepLoop):
                 f"Try another --method or --optimizer, or a frame with the object at its centre"
             )
 
-    def _keep_weights(self) -> None:
+    def _look(self) -> None:
         if self.steps in self._keep:
             self.kept[self.steps] = self.weights()
+        if self._prober.wants(self.steps):
+            self._prober(self.steps, self.finite_weights())
 
 
 class _Prober:
     """Compares gradients on one random training batch at a time and keeps what it finds."""
 
-    def __init__(self, prepared: Prepared, settings: Settings, wanted: bool) -> None:
+    def __init__(
+        self, prepared: Prepared, settings: Settings, wanted: bool, exchanged: Exchanged
+    ) -> None:
+        if settings.probe_every < 1:
+            raise ValueError(f"`probe_every` must be 1 step or more, got {settings.probe_every}")
         began = time.perf_counter()
         self.probes: list[Probe] = []
         self._layers = sgm_blocks(settings).sgm_layers
+        self._names = [f"{kind}{k}" for k in self._layers for kind in PROBED]
+        self._every = settings.probe_every
         self._rng = np.random.default_rng([settings.seed, 2])
         self._session = None
         self._bundle = prepared.bundle
         name = probe_file(settings.layers)
         if wanted and self._layers and name in prepared.bundle.manifest["files"]:
-            self._session = prepared.bundle.session(name, settings.threads)
+            constants = constants_of(exchanged, tuned_layers(settings.layers))
+            self._session = prepared.bundle.session(name, settings.threads, constants)
+            self._refuse_unless_complete(name, self._session)
         self._data = {"features": prepared.features, "labels": prepared.labels}
         self.seconds = time.perf_counter() - began
 
-    def __call__(self, epoch: int, weights: Mapping[str, Array]) -> None:
-        if self._session is None:
-            return
+    def wants(self, step: int) -> bool:
+        return self._session is not None and step % self._every == 0
+
+    def __call__(self, step: int, weights: Mapping[str, Array]) -> None:
+        assert self._session is not None, "nobody wants to probe"
         began = time.perf_counter()
         rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
-        names = [f"{kind}{k}" for k in self._layers for kind in PROBED]
-        options = ort.RunOptions()
-        options.only_execute_path_to_fetches = True  # not the SGMs that take no part in the run
+        feeds = {**self._data, "rows": rows, **weights}
         with running_graphs(self._bundle):
-            values = self._session.run(names, {**self._data, "rows": rows, **weights}, options)
-        outputs = dict(zip(names, values, strict=True))
-        self.probes.append(Probe(epoch, compare_probe(outputs, self._layers)))
+            values = self._session.run(self._names, feeds, only_what_is_asked())
+        outputs = dict(zip(self._names, values, strict=True))
+        self.probes.append(Probe(step, compare_probe(outputs, self._layers)))
         self.seconds += time.perf_counter() - began
+
+    def _refuse_unless_complete(self, name: str, session: ort.InferenceSession) -> None:
+        there = {output.name for output in session.get_outputs()}
+        missing = [wanted for wanted in self._names if wanted not in there]
+        if missing:
+            raise QsgmError(
+                f"{name} of the bundle {self._bundle.folder} has no output {missing[0]}: another "
+                f"version of qsgm wrote it; export it again with `{COMMAND}`"
+            )
 
 
 def _in_step_layout(weights: Mapping[str, Array]) -> dict[str, Array]:

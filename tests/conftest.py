@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -18,16 +19,20 @@ from qsgm import bundle as bundles
 from qsgm.blocks import one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.crops import cut_crops, plan_crops
+from qsgm.folded import FoldedSgm
 from qsgm.images import write_png
-from qsgm.train.calibrate import float_trace
-from qsgm.train.fold import FoldedNet, FoldedSgm, fold_net, fold_sgm
+from qsgm.quantize import QuantizedSgm, SgmRanges, quantize_sgm
+from qsgm.train.calibrate import Demonstration, float_trace
+from qsgm.train.export import build_trunks, bundle_files
+from qsgm.train.fold import FoldedNet, fold_net, fold_sgm
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
-from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
+from qsgm.train.graphs.trunk import initializer_offsets, network_model
 from qsgm.train.graspnet import CHANNELS, GraspNet, Loss, normalize
-from qsgm.train.quantize import QuantizedSgm, SgmRanges, quantize_sgm
+from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
 from qsgm.train.sgm import Sgm
+from qsgm.train.trunk_ranges import calibration_crops, observe_crops
 
 # Threads that wait for each other on a busy machine take longer than this work does.
 torch.set_num_threads(1)
@@ -120,11 +125,12 @@ def write_bundle(folder: Path) -> None:
     """Every graph a bundle holds, and the manifest."""
     torch.manual_seed(0)
     net, loss = fold_net(_random_net()), Loss()
+    net, int8_trunk = _quantized_trunk(net)
     float_sgms = {layer: _random_sgm(layer) for layer in tuned_layers(MOST_LAYERS)[:-1]}
     int8_sgms = {layer: _quantized(sgm) for layer, sgm in float_sgms.items()}
     models = {bundles.NETWORK: network_model(net, loss.encoding)}
     for tuned in range(1, MOST_LAYERS + 1):
-        models[bundles.trunk_file(tuned)] = trunk_model(net, 6 - tuned)
+        models |= build_trunks(net, int8_trunk, tuned)
         models[bundles.head_file(tuned)] = head_model(net, tuned, loss.encoding)
         if tuned > 1:
             probe = probe_model(net, tuned, float_sgms, int8_sgms, loss)
@@ -136,9 +142,11 @@ def write_bundle(folder: Path) -> None:
     for precision, name, blocks in product(precisions, OPTIMIZERS, [*BLOCKS, *WHOLE]):
         step = step_model(net, blocks, precisions[precision], loss, OPTIMIZERS[name])
         models[bundles.step_file(precision, name, blocks)] = step
-    for file, model in models.items():
-        (folder / file).write_bytes(model.SerializeToString())
-    (folder / bundles.MANIFEST).write_text(json.dumps(_manifest(folder, net, loss)))
+    files, sgms = bundle_files(models, int8_sgms, float_sgms)
+    for file, data in files.items():
+        (folder / file).write_bytes(data)
+    manifest = _manifest(folder, net, loss) | {"sgms": sgms}
+    (folder / bundles.MANIFEST).write_text(json.dumps(manifest))
 
 
 def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
@@ -156,6 +164,7 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
         "encoding": loss.encoding,
         "label_smoothing": loss.label_smoothing,
         "most_layers": MOST_LAYERS,
+        "trunk": "float",
         "blocks": [str(blocks) for blocks in BLOCKS],
         "recipes": {
             "sgm": {
@@ -171,7 +180,7 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
         },
         "files": {
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-            for path in sorted(folder.glob("*.onnx"))
+            for path in sorted([*folder.glob("*.onnx"), folder / bundles.WEIGHTS])
         },
     }
 
@@ -185,6 +194,14 @@ def _random_net() -> GraspNet:
         for _ in range(20):
             net(normalize(torch.from_numpy(cut_crops(frame, plan))))
     return net.eval()
+
+
+def _quantized_trunk(net: FoldedNet) -> tuple[FoldedNet, dict[int, QuantizedLayer]]:
+    """The network with steps for u8 features, and its frozen layers in int8."""
+    demonstration = Demonstration(draw_frame()[0], (320, 240))
+    crops = calibration_crops(demonstration, np.random.default_rng(1))
+    ranges = dict(observe_crops(net, crops))
+    return replace(net, feature_steps=feature_steps(ranges)), quantize_trunk(net, ranges)
 
 
 def _random_sgm(layer: int) -> FoldedSgm:

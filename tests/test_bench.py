@@ -4,8 +4,9 @@ import io
 import json
 import math
 from dataclasses import astuple, replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from qsgm import QsgmError, cli
-from qsgm.bench import accuracy
+from qsgm.bench import accuracy, speed
 from qsgm.bench.accuracy import ANGLE, AccuracyReport, curve_steps, measure_accuracy
 from qsgm.bench.accuracy_report import accuracy_report_json, render, statistics
 from qsgm.bench.frames import BenchFrame, list_frames
@@ -384,6 +385,23 @@ def test_speed_runs_the_same_job_in_processes_of_their_own(
     assert set(report["seconds"]) >= {"sgm int8", "sgm float", "bp"}
     assert report["steps"] == 25
     assert report["ratios"]["torch_bp_step_over_qsgm_step"] > 0
+
+
+def test_speed_hands_its_settings_to_every_process(
+    monkeypatch: pytest.MonkeyPatch, frame_path: Path, bundle: Bundle
+) -> None:
+    jobs: list[list[str]] = []
+
+    def record(job: list[str], **_: object) -> SimpleNamespace:
+        jobs.append(job)
+        return SimpleNamespace(returncode=0, stdout='{"seconds": {}}')
+
+    monkeypatch.setattr(speed.subprocess, "run", record)
+    settings = Settings(layers=2, trunk="int8", epochs=7, seed=3, threads=2)
+    speed.run_once("sgm float", frame_path, bundle, settings)
+    options = dict(pairwise(jobs[0]))
+    names = ("--layers", "--trunk", "--epochs", "--seed", "--threads")
+    assert [options[name] for name in names] == ["2", "int8", "7", "3", "2"]
 
 
 def test_speed_names_the_variant_that_failed(bundle: Bundle, tmp_path: Path) -> None:

@@ -112,6 +112,23 @@ def taught(qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path) -> 
     return folder
 
 
+@pytest.mark.parametrize(
+    ("options", "used"),
+    [((), "float"), (("--trunk", "int8"), "int8"), (("--trunk", "float"), "float")],
+)
+def test_the_frozen_layers_precision_is_the_bundles_unless_it_is_given(
+    qsgm: Run,
+    frame_path: Path,
+    bundle_folder: Path,
+    tmp_path: Path,
+    options: tuple[str, ...],
+    used: str,
+) -> None:
+    common = ("--json", "--epochs", 0, "--bundle", bundle_folder, *options, frame_path)
+    assert qsgm("finetune", "-o", tmp_path / "bar", *common).json["trunk"] == used
+    assert qsgm("fidelity", *common).json["trunk"] == used
+
+
 def test_finetune_prints_one_json_object_with_the_stable_keys(
     qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
 ) -> None:
@@ -376,10 +393,10 @@ def test_a_spoilt_bundle_is_refused_in_one_line(
     qsgm: Run, frame_path: Path, own_bundle: Path, tmp_path: Path
 ) -> None:
     command = ("finetune", "--bundle", own_bundle, "-o", tmp_path / "out", frame_path)
-    (own_bundle / trunk_file(3)).write_bytes(b"altered")
-    assert_refused(qsgm(*command), 1, "trunk_3.onnx", "qsgm fold-and-quantize")
-    (own_bundle / trunk_file(3)).unlink()
-    assert_refused(qsgm(*command), 1, "lacks trunk_3.onnx")
+    (own_bundle / trunk_file("float", 3)).write_bytes(b"altered")
+    assert_refused(qsgm(*command), 1, "trunk_float_3.onnx", "qsgm fold-and-quantize")
+    (own_bundle / trunk_file("float", 3)).unlink()
+    assert_refused(qsgm(*command), 1, "lacks trunk_float_3.onnx")
     (own_bundle / "manifest.json").unlink()
     assert_refused(qsgm(*command), 1, "manifest.json")
     missing = ("finetune", "--bundle", tmp_path / "nowhere", frame_path)

@@ -32,7 +32,7 @@ RATES = {"6": (4e-3,), "5,6": (2e-3, 3e-3), "4,5,6": (1e-3, 2e-3, 3e-3)}
 RATES["4-5,6"] = (5e-3, 6e-3, 7e-3)
 GRAPHS = {
     "network.onnx",
-    *(f"{kind}_{n}.onnx" for kind in ("trunk", "head") for n in (1, 2, 3)),
+    *(f"{kind}_{n}.onnx" for kind in ("trunk_int8", "trunk_float", "head") for n in (1, 2, 3)),
     *(f"step_float_{name}_{b}.onnx" for name in ("sgd", "adam") for b in ("6", "5-6", "4-6")),
     *(
         f"step_{precision}_{optimizer}_{blocks}.onnx"
@@ -102,9 +102,9 @@ def bundle(report: ExportReport) -> Bundle:
 
 
 def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
-    assert set(bundle.manifest["files"]) == GRAPHS
+    assert set(bundle.manifest["files"]) == {*GRAPHS, "weights.bin"}
     others = {"manifest.json", "README.md", "SHA256SUMS"}
-    assert {path.name for path in bundle.folder.iterdir()} == GRAPHS | others
+    assert {path.name for path in bundle.folder.iterdir()} == {*GRAPHS, "weights.bin"} | others
     for name in GRAPHS:
         assert bundle.manifest["files"][name]["bytes"] == (bundle.folder / name).stat().st_size
         onnx.checker.check_model(onnx.load(bundle.folder / name), full_check=True)
@@ -145,7 +145,7 @@ def test_exported_steps_train(bundle: Bundle, blocks: str, optimizer: str, preci
     session = bundle.session(f"step_{precision}_{optimizer}_{blocks}.onnx")
     tuned = len(parse_blocks(blocks).layers)
     rng = np.random.default_rng(0)
-    features = rng.random((40, 169 if tuned == 3 else 1, 16), np.float32)
+    features = rng.integers(0, 256, (40, 169 if tuned == 3 else 1, 16), dtype=np.uint8)
     labels = rng.uniform(0, 1, (40, 3)).astype(np.float32)
     start = {
         name: to_step_layout(value) if value.ndim > 1 else value
@@ -166,11 +166,14 @@ def test_the_report_has_its_keys(workplace: Workplace, report: ExportReport) -> 
     for layer in values["layers"].values():
         assert set(layer) >= FIDELITY | {"range", "bytes"}
     assert values["fold_max_abs_error"] < 1e-4
-    # (19*8+8) + (8*6+6) + (6*16+16) numbers; in int8 each weight is two bytes, and
-    # every row has a bias and two scales, every input an offset and a gain.
+    # (19*8+8) + (8*6+6) + (6*16+16) numbers; in int8 each weight is three bytes: the
+    # coarse plane is there for either plane of what it meets. Every row has a bias and two
+    # scales, every input an offset and a gain.
     assert values["bytes"]["float"] == 2 * 4 * (160 + 54 + 112)
-    assert values["bytes"]["int8"] == 2 * (2 * (152 + 48 + 96) + 12 * (8 + 6 + 16) + 8 * 19)
-    sizes = [(workplace.folder / "first" / name).stat().st_size for name in GRAPHS]
+    assert values["bytes"]["int8"] == 2 * (3 * (152 + 48 + 96) + 12 * (8 + 6 + 16) + 8 * 19)
+    sizes = [
+        (workplace.folder / "first" / name).stat().st_size for name in {*GRAPHS, "weights.bin"}
+    ]
     assert values["bundle_bytes"] == sum(sizes)
 
 
@@ -267,7 +270,7 @@ def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> No
     model = onnx.load(bundle.folder / "step_int8_sgd_4,5,6.onnx")
     refuse_float_products("step", model)
     # ONNX Runtime has no integer product with a factor on its sum and a bias.
-    gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][3]
+    gemm = [node for node in model.graph.node if node.name.startswith("layer5/Gemm")][2]
     gemm.attribute.append(onnx.helper.make_attribute("alpha", 2.0))
     with pytest.raises(QsgmError, match=r"step: .* computes 5 of the 6 int8 products of layer5"):
         refuse_float_products("step", model)

@@ -244,7 +244,7 @@ def test_both_tables_fit_a_terminal_of_80_columns_and_show_every_metric(
     rows = [line.split() for line in lines if line.split()[:1] == ["4"]]
     mean = five.fidelity[4]
     assert [len(row) for row in rows] == [8, 8]
-    assert rows[0][1:3] == [f"{mean.cos_int8_float:.4f}", f"{mean.cos_int8_true:.3f}"]
+    assert rows[0][1:3] == [f"{mean.cos_int8_float:.5f}", f"{mean.cos_int8_true:.3f}"]
     assert rows[1][1:3] == [f"{mean.direction_deviation_deg:.2f}", f"{mean.weighted_error:.4f}"]
     assert rows[1][5:] == [
         f"{mean.cos_update_int8_float:.4f}",

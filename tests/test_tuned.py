@@ -102,7 +102,7 @@ def test_a_description_that_says_nonsense_is_refused(saved: Path, key: str, valu
 
 
 def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Path) -> None:
-    save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_3.onnx").read_bytes(), {})
+    save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_float_6.onnx").read_bytes(), {})
     text = refusal(tmp_path / "mug")
     assert "takes ['crops'] and gives ['features'], expected a frame and its heatmap" in text
 

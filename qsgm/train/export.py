@@ -8,6 +8,7 @@ same frames give the same bytes.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from qsgm.bundle import (
     NETWORK,
     PRECISIONS,
     VERSION,
+    WEIGHTS,
     OptimizerName,
     Precision,
     head_file,
@@ -32,7 +34,10 @@ from qsgm.bundle import (
 from qsgm.crops import cut_crops, label_crops, plan_crops
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
+from qsgm.folded import FoldedSgm
+from qsgm.quantize import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.calibrate import (
+    AUTO,
     EPOCHS,
     CalibrationSet,
     Demonstration,
@@ -45,18 +50,27 @@ from qsgm.train.calibrate import (
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.curvature import FLAT
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
-from qsgm.train.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
+from qsgm.train.fold import FoldedNet, net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
+from qsgm.train.graphs.sharing import SharedConstants
 from qsgm.train.graphs.step import AnySgm, step_model
-from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
+from qsgm.train.graphs.trunk import (
+    initializer_offsets,
+    int8_trunk_model,
+    network_model,
+    trunk_model,
+)
 from qsgm.train.graspnet import normalize
-from qsgm.train.quantize import QuantizedSgm, quantize_sgm
+from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
+from qsgm.train.trunk_ranges import observe_trunk
 
 SEED = 0
 # No other folder that qsgm writes holds a file of this name; `manifest.json` is in two kinds.
-MARKER = trunk_file(1)
+MARKER = head_file(1)
+# Of the frozen layers, unless the user says otherwise: in int8 they take longer (README).
+TRUNK: Precision = "float"
 OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
 # Exported beside each layer on its own, as far as the checkpoint can tune so many layers.
 GROUPED = ("4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6")
@@ -77,6 +91,8 @@ def fold_and_quantize(
     watch: Watch,
     epochs: int = EPOCHS,
     blocks: Sequence[Blocks] = (),
+    calibrator: str = AUTO,
+    activation_bits: ActivationBits = 16,
 ) -> ExportReport:
     """Export a checkpoint as a bundle.
 
@@ -87,6 +103,8 @@ def fold_and_quantize(
         watch: told about progress.
         epochs: length of each fine-tuning run that ranges are taken along.
         blocks: to be tuned beside :data:`GROUPED` and each layer on its own.
+        calibrator: whose ranges the SGMs get, see :func:`qsgm.train.calibrate.calibrate`.
+        activation_bits: of the int8 SGMs' inputs and hidden tensors, in one u8 plane or two.
 
     Raises:
         QsgmError: the checkpoint or the calibration set cannot be used, the output folder holds
@@ -97,36 +115,41 @@ def fold_and_quantize(
     exported = exported_blocks(trainee.checkpoint.most_layers, blocks)
     frames = CalibrationSet(calib_folder)
     fold_error = check_folding(trainee, frames[0])
-    ranges = calibrate(trainee, frames, SEED, watch, epochs)
-    int8_sgms = {k: quantize_sgm(sgm, ranges[k]) for k, sgm in trainee.sgms.items()}
+    trainee, int8_trunk = calibrate_trunk(trainee, frames, watch)
+    calibration = calibrate(trainee, frames, SEED, watch, epochs, calibrator, activation_bits)
+    int8_sgms = {
+        k: quantize_sgm(sgm, calibration.ranges[k], activation_bits)
+        for k, sgm in trainee.sgms.items()
+    }
     fidelity = measure(trainee, int8_sgms, frames, SEED, watch, epochs)
-    graphs = build_graphs(trainee, int8_sgms, exported)
+    graphs = build_graphs(trainee, int8_sgms, int8_trunk, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)
-    files = {name: model.SerializeToString() for name, model in graphs.items()}
-    report = ExportReport(
-        str(output_folder),
-        {
-            k: LayerReport(fidelity[k], ranges[k], sgm, int8_sgms[k])
-            for k, sgm in trainee.sgms.items()
-        },
-        fold_error,
-        sum(len(data) for data in files.values()),
-    )
-    provenance = Provenance(
-        checkpoint_path.name,
-        sha256(checkpoint_path.read_bytes()),
+    files, sgms = bundle_files(graphs, int8_sgms, trainee.sgms)
+    layers = {
+        k: LayerReport(fidelity[k], calibration.ranges[k], sgm, int8_sgms[k])
+        for k, sgm in trainee.sgms.items()
+    }
+    size = sum(len(data) for data in files.values())
+    report = ExportReport(str(output_folder), layers, calibration, fold_error, size)
+    description = describe(trainee, exported, files) | {"sgms": sgms}
+    files[MANIFEST] = (json.dumps(description, indent=1, sort_keys=True) + "\n").encode()
+    files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, frames)).encode()
+    with new_folder(output_folder, MARKER) as new:
+        for name, data in files.items():
+            (new / name).write_bytes(data)
+    return report
+
+
+def provenance(path: Path, trainee: Trainee, frames: CalibrationSet) -> Provenance:
+    """What a bundle is made from: a checkpoint's file and a calibration set."""
+    return Provenance(
+        path.name,
+        sha256(path.read_bytes()),
         trainee.checkpoint.card,
         len(frames),
         sha256(frames.manifest_bytes),
     )
-    with new_folder(output_folder, MARKER) as new:
-        for name, data in files.items():
-            (new / name).write_bytes(data)
-        manifest = json.dumps(describe(trainee, exported, files), indent=1, sort_keys=True)
-        (new / MANIFEST).write_text(manifest + "\n")
-        (new / "README.md").write_text(model_card(report, provenance))
-    return report
 
 
 @torch.no_grad()
@@ -179,20 +202,43 @@ def exported_blocks(most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
     return list(dict.fromkeys([*singles, *grouped, *more]))
 
 
+def calibrate_trunk(
+    trainee: Trainee, frames: CalibrationSet, watch: Watch
+) -> tuple[Trainee, dict[int, QuantizedLayer]]:
+    """The same with steps for u8 features, and its layers that can be frozen in int8."""
+    ranges = observe_trunk(trainee.net, frames, SEED, watch)
+    net = replace(trainee.net, feature_steps=feature_steps(ranges))
+    return replace(trainee, net=net), quantize_trunk(net, ranges)
+
+
 def build_graphs(
-    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], blocks: Sequence[Blocks]
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    int8_trunk: Mapping[int, QuantizedLayer],
+    blocks: Sequence[Blocks],
 ) -> dict[str, ModelProto]:
     """Every graph of a bundle, by file name."""
     net, loss, most = trainee.net, trainee.checkpoint.loss, trainee.checkpoint.most_layers
     graphs = {NETWORK: network_model(net, loss.encoding)}
     for tuned in range(1, most + 1):
-        graphs[trunk_file(tuned)] = trunk_model(net, LAYERS - tuned)
+        graphs |= build_trunks(net, int8_trunk, tuned)
         graphs[head_file(tuned)] = head_model(net, tuned, loss.encoding)
         if tuned > 1:
             graphs[probe_file(tuned)] = probe_model(net, tuned, trainee.sgms, int8_sgms, loss)
     for one in dict.fromkeys([*blocks, *map(one_block, range(1, most + 1))]):
         graphs |= build_steps(trainee, int8_sgms, one)
     return graphs
+
+
+def build_trunks(
+    net: FoldedNet, int8_trunk: Mapping[int, QuantizedLayer], tuned: int
+) -> dict[str, ModelProto]:
+    """The frozen layers when the last `tuned` are tuned; if none are, there is one precision."""
+    last_frozen = LAYERS - tuned
+    trunks = {trunk_file("float", tuned): trunk_model(net, last_frozen)}
+    if last_frozen > 0:
+        trunks[trunk_file("int8", tuned)] = int8_trunk_model(net, int8_trunk, last_frozen)
+    return trunks
 
 
 def build_steps(
@@ -212,6 +258,32 @@ def build_steps(
     }
 
 
+def bundle_files(
+    graphs: Mapping[str, ModelProto],
+    int8_sgms: Mapping[int, QuantizedSgm],
+    float_sgms: Mapping[int, FoldedSgm],
+) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Every file of a bundle but its manifest, and what that says of the SGMs.
+
+    Constants lie in one file beside the graphs, which are changed. The network is left whole: a
+    tuned object is a copy of it. The device reads the float SGMs when it calibrates anew.
+    """
+    shared = SharedConstants(WEIGHTS)
+    sgms = {
+        str(layer): {
+            "bits": int8_sgms[layer].bits,
+            "convolutions": [
+                {"weight": shared.add_array(conv.weight), "bias": shared.add_array(conv.bias)}
+                for conv in sgm.convs
+            ],
+        }
+        for layer, sgm in float_sgms.items()
+    }
+    shared.take_from(model for name, model in graphs.items() if name != NETWORK)
+    files = {name: model.SerializeToString() for name, model in graphs.items()}
+    return files | {WEIGHTS: shared.data}, sgms
+
+
 def describe(
     trainee: Trainee, blocks: Sequence[Blocks], files: Mapping[str, bytes]
 ) -> dict[str, Any]:
@@ -223,6 +295,7 @@ def describe(
         "encoding": loss.encoding,
         "label_smoothing": loss.label_smoothing,
         "most_layers": trainee.checkpoint.most_layers,
+        "trunk": TRUNK,
         "blocks": [str(one) for one in blocks],
         "files": {
             name: {"sha256": sha256(data), "bytes": len(data)} for name, data in files.items()

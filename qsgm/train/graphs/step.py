@@ -14,8 +14,10 @@ from onnx import ModelProto
 
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
+from qsgm.folded import FoldedSgm
+from qsgm.quantize import QuantizedSgm
 from qsgm.train.curvature import FLAT, Curvature
-from qsgm.train.fold import FoldedNet, FoldedSgm
+from qsgm.train.fold import FoldedNet
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import (
     Batch,
@@ -33,7 +35,6 @@ from qsgm.train.graphs.loss import loss_and_error
 from qsgm.train.graphs.optimizers import Optimizer, Rule
 from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graspnet import Loss
-from qsgm.train.quantize import QuantizedSgm
 
 AnySgm = FoldedSgm | QuantizedSgm
 
