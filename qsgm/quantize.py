@@ -34,6 +34,7 @@ from qsgm.weights import to_step_layout
 ActivationBits = Literal[8, 16]
 WeightBits = Literal[4, 6, 8, 16]  # fewer than 16 leave the fine plane empty
 ACTIVATION_BITS: tuple[ActivationBits, ...] = get_args(ActivationBits)
+WEIGHT_BITS: tuple[WeightBits, ...] = get_args(WeightBits)
 U8_MAX = 255
 # One step of a coarse (high) plane in steps of the fine (low) one.
 PLANE_STEPS = 256

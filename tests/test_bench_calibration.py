@@ -18,6 +18,7 @@ from qsgm.bench.calibration import (
     METRICS,
     OWN_CROPS,
     OWN_RUN,
+    VARIANTS,
     WARNED,
     CalibrationReport,
     Variant,
@@ -26,6 +27,7 @@ from qsgm.bench.calibration import (
     exchange,
     measure_calibration,
     observe_run,
+    parse_variant,
     ranges_seen,
 )
 from qsgm.bench.frames import BenchFrame, list_frames
@@ -114,6 +116,14 @@ def test_a_loss_is_a_missed_crop_in_a_hundred_or_an_angle_beyond_what_runs_diffe
     assert rates["warned_of_lost"] == pytest.approx(1 / 2)
     assert rates["warned_of_kept"] == pytest.approx(1 / 6, abs=1e-4)
     assert report.elongated.tolist() == [True, False]
+
+
+def test_a_variant_reads_as_it_prints() -> None:
+    for variant in VARIANTS:
+        assert parse_variant(str(variant)) == variant
+    for text in ("", "8/16", "7/16/minmax", "8/16/best", "8/16/minmax/"):
+        with pytest.raises(QsgmError, match="is no variant: expected bits of activations"):
+            parse_variant(text)
 
 
 def test_sets_go_from_noise_to_the_whole_set(frames_folder: Path) -> None:

@@ -322,7 +322,7 @@ def test_a_run_in_float_never_warns_of_drift(frame: Frame, bundle: Bundle) -> No
         low, *highs = (np.zeros(19, np.float32), *(np.full(n, 1e-4, np.float32) for n in (19, 12)))
         low[-2:] = -1
         narrow[layer] = constants(quantize_sgm(sgm, SgmRanges(low, highs[0], (highs[1],))))
-    assert len(train(prepared, SHORT, exchanged=narrow).warnings) == 2
+    assert train(prepared, SHORT, exchanged=narrow).warnings
     in_float = replace(SHORT, precision="float")
     assert train(prepared, in_float, exchanged=narrow).warnings == ()
 

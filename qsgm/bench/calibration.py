@@ -36,8 +36,10 @@ from qsgm.finetuning import (
     train,
 )
 from qsgm.folded import FloatArray, float_trace
-from qsgm.observers import SgmObservers
+from qsgm.observers import CALIBRATORS, SgmObservers
 from qsgm.quantize import (
+    ACTIVATION_BITS,
+    WEIGHT_BITS,
     ActivationBits,
     SgmRanges,
     WeightBits,
@@ -60,7 +62,7 @@ OBSERVED_CROPS = 256
 DARK = 0.25  # times the brightness
 PLAIN_TABLES = ("plain", "gradient")
 NOISE_FRAMES = 4
-OWN_RUN, OWN_CROPS = "the object itself", "its crops (--recalibrate)"
+OWN_RUN, OWN_CROPS = "the object itself", "its crops, anew"  # by --recalibrate
 # A frame has lost accuracy to quantization if it is off by more than runs differ anyway.
 LOST_DETECTION, LOST_ANGLE_DEG, LOST_ANGLE_SHARE = 0.01, 0.25, 0.15
 # of one run, in this order
@@ -73,9 +75,10 @@ METRICS = (
     "warned",
 )
 COS_FLOAT, COS_TRUE, CLIPPED, DETECTION, ANGLE, WARNED = range(len(METRICS))
-LEGEND = """means over frames; cos: of int8 to float (and the worst frame's), to true gradients;
-clip: share of inputs outside their ranges, in %; angle: error in degrees, modulo
-180°; lost: share of frames worse than with float SGMs; warned: of frames"""
+LEGEND = """N/M: bits of activations/weights; means over frames; cos: of int8 to float
+gradients, and the worst frame's; true: to true ones; clip: share of inputs outside
+their ranges, in %; angle: error in degrees, modulo 180°; lost: share of frames
+worse than with float SGMs; warned: share of frames the drift watch fired on"""
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,25 @@ class Variant:
     calibrator: str
 
     def __str__(self) -> str:
-        return f"a{self.activation_bits} w{self.weight_bits} {self.calibrator}"
+        return f"{self.activation_bits}/{self.weight_bits}/{self.calibrator}"
+
+
+def parse_variant(text: str) -> Variant:
+    """A variant as it prints, such as `8/16/minmax`. Raises QsgmError for anything else."""
+    for activation_bits, weight_bits, name in product(ACTIVATION_BITS, WEIGHT_BITS, CALIBRATORS):
+        variant = Variant(activation_bits, weight_bits, name)
+        if str(variant) == text:
+            return variant
+    raise QsgmError(
+        f"{text!r} is no variant: expected bits of activations ({bits_text(ACTIVATION_BITS)}) and "
+        f"of weights ({bits_text(WEIGHT_BITS)}) and a calibrator ({', '.join(CALIBRATORS)}), such "
+        "as 8/16/minmax"
+    )
+
+
+def bits_text(bits: Sequence[int]) -> str:
+    """Numbers in a message."""
+    return ", ".join(map(str, bits))
 
 
 # (layer, variant) -> what its SGM has to cover
@@ -169,7 +190,9 @@ class CalibrationReport:
                 "cos_float_true": number(floating[:, COS_TRUE].mean(), 4),
                 "detection_accuracy": number(floating[:, DETECTION].mean(), 4),
                 "angle_mae_deg": number(floating[self.elongated, ANGLE].mean(), 3),
+                "per_frame": floating.round(6).tolist(),
             },
+            "metrics": list(METRICS),
             "sources": {
                 source: {
                     str(variant): self.summary(i, k)

@@ -12,7 +12,7 @@ from qsgm.bench.calibration import ANGLE, CalibrationReport, Floats, Variant
 from qsgm.files import write_bytes_atomic
 from qsgm.train.charts import DPI, GREY, SMALL, TEXT
 
-WIDTH_INCHES, ROW_INCHES, HEADER_INCHES, FOOTER_INCHES = 9.0, 0.46, 1.25, 0.85
+WIDTH_INCHES, ROW_INCHES, HEADER_INCHES, FOOTER_INCHES = 9.0, 0.46, 1.0, 0.6
 # White: as good as float; the darkest orange: this many times its angle error.
 WORST_RATIO = 10.0
 COLOURS = LinearSegmentedColormap.from_list("loss", ["#FFFFFF", "#F6C19A", "#D55E00", "#7A3300"])
@@ -35,7 +35,7 @@ def calibration_chart(report: CalibrationReport) -> Figure:
     height = HEADER_INCHES + ROW_INCHES * len(report.sources) + FOOTER_INCHES
     figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI)
     axes = figure.add_axes(
-        (0.235, FOOTER_INCHES / height, 0.75, 1 - (HEADER_INCHES + FOOTER_INCHES) / height)
+        (0.23, FOOTER_INCHES / height, 0.75, 1 - (HEADER_INCHES + FOOTER_INCHES) / height)
     )
     angles, floating = angle_errors(report)
     ratio = np.maximum(angles / floating, 1.0)
@@ -49,7 +49,7 @@ def calibration_chart(report: CalibrationReport) -> Figure:
         axes.text(
             k + 0.5,
             i + 0.5,
-            f"{angles[i, k]:.2f}°\n{cosine:.4f}",
+            f"{angles[i, k]:.2f}°\n{cosine:.4f}".replace("-", "−"),
             ha="center",
             va="center",
             fontsize=SMALL,
@@ -63,6 +63,14 @@ def calibration_chart(report: CalibrationReport) -> Figure:
         fontsize=TEXT,
         fontweight="bold",
         va="top",
+    )
+    figure.text(
+        0.22,
+        1 - (HEADER_INCHES - 0.06) / height,
+        "activations\nweights\ncalibrator",
+        fontsize=SMALL,
+        color=GREY,
+        ha="right",
     )
     figure.text(0.015, 0.12 / height, caption(report, floating), fontsize=SMALL, color=GREY)
     return figure
@@ -89,8 +97,7 @@ def label_axes(axes: Axes, report: CalibrationReport) -> None:
 
 def heading(variant: Variant) -> str:
     """A variant on three lines."""
-    bits = f"{variant.activation_bits} bit", f"{variant.weight_bits} bit"
-    return f"activ. {bits[0]}\nweights {bits[1]}\n{variant.calibrator}"
+    return f"{variant.activation_bits} bit\n{variant.weight_bits} bit\n{variant.calibrator}"
 
 
 def caption(report: CalibrationReport, floating: float) -> str:
