@@ -530,6 +530,59 @@ def bench_speed(
     _show(report, render(report), as_json)
 
 
+@bench.command("resources")
+def bench_resources(
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Steps of every variant.")] = 15,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Operations, bytes and time of layers and SGMs: the paper's Table 3, and this bundle's."""
+    from qsgm.bench.resources import measure_resources
+
+    with _progress() as watch:
+        report = measure_resources(_bundle(bundle), repeats, threads, watch)
+    _write_report(report.to_json(), output)
+    _show(report.to_json(), report.render(), as_json)
+
+
+@bench.command("memory")
+def bench_memory(
+    frames: FramesOption = None,
+    processes: Annotated[
+        str,
+        typer.Option(metavar="N,N", help="Tuned layers of whole processes; '' for none."),
+    ] = "3,6",
+    trunk: TrunkOption = None,
+    epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Of the processes.")] = 1,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the peaks, a PNG (matplotlib).")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
+    from qsgm.bench.frames import list_frames
+    from qsgm.bench.memory import measure_memory
+    from qsgm.finetuning import Settings
+
+    lengths = _layer_counts(processes)
+    host = _host_module("qsgm.train.liveness")
+    chart = None if picture is None else _host_module("qsgm.train.memory_chart")
+    frame = list_frames(paths.calibration_folder() if frames is None else frames, 1)[0].path
+    settings = Settings(trunk=_value(trunk), epochs=epochs, seed=seed, threads=threads)
+    with _progress() as watch:
+        report = measure_memory(frame, _bundle(bundle), settings, lengths, host.step_memory, watch)
+    _write_report(report.to_json(), output)
+    if picture is not None and chart is not None:
+        chart.write_memory_chart(report, picture)
+    _show(report.to_json(), report.render(), as_json)
+
+
 @bench.command("fidelity")
 def bench_fidelity(
     frames: FramesOption = None,
@@ -563,6 +616,12 @@ def bench_calibration(
     calib: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
     ] = None,
+    variants: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--variant", metavar="A/W/NAME", help="Bits and calibrator; repeatable. Else: eight."
+        ),
+    ] = None,
     epochs: EpochsOption = defaults.EPOCHS,
     limit: LimitOption = None,
     seed: SeedOption = 0,
@@ -575,7 +634,7 @@ def bench_calibration(
     as_json: JsonOption = False,
 ) -> None:
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
-    from qsgm.bench.calibration import measure_calibration
+    from qsgm.bench.calibration import VARIANTS, measure_calibration, parse_variant
     from qsgm.bench.frames import list_frames
     from qsgm.finetuning import Settings
 
@@ -583,8 +642,9 @@ def bench_calibration(
     folder = paths.calibration_folder(calib)
     some = list_frames(folder if frames is None else frames, limit)
     settings = Settings(epochs=epochs, seed=seed, threads=threads)
+    chosen = [parse_variant(text) for text in variants] if variants else VARIANTS
     with _progress() as watch:
-        report = measure_calibration(some, folder, _bundle(bundle), settings, watch)
+        report = measure_calibration(some, folder, _bundle(bundle), settings, watch, chosen)
     _write_report(report.to_json(), output)
     if picture is not None and chart is not None:
         chart.write_calibration_chart(report, picture)
@@ -786,6 +846,20 @@ def _run_lengths(text: str) -> tuple[int, ...]:
             param_hint="'--short'",
         )
     return lengths
+
+
+def _layer_counts(text: str) -> tuple[int, ...]:
+    try:
+        counts = tuple(int(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        counts = (0,)
+    if not all(1 <= count <= defaults.MOST_LAYERS for count in counts):
+        raise typer.BadParameter(
+            f"{text!r} gives no numbers of layers: expected 1 to {defaults.MOST_LAYERS}, such as "
+            "3,6",
+            param_hint="'--processes'",
+        )
+    return counts
 
 
 def _center(text: str | None) -> tuple[float, float] | None:

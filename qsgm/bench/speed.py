@@ -94,8 +94,13 @@ def ratios(medians: Mapping[str, Seconds], forward: float) -> dict[str, float | 
     return {name: number(value, 3) for name, value in found.items()}
 
 
-def run_once(name: str, frame: Path, bundle: Bundle, settings: Settings) -> Seconds:
-    """One variant in a process of its own: its stages' seconds, and the process's from outside."""
+def run_once(
+    name: str, frame: Path, bundle: Bundle, settings: Settings, launcher: Sequence[str] = ("-m",)
+) -> Seconds:
+    """One variant in a process of its own: its stages' seconds, and the process's from outside.
+
+    `launcher` is what Python gets before the module and its arguments.
+    """
     folder = bundle.folder.resolve()
     layers, epochs, seed, threads = (
         str(value) for value in (settings.layers, settings.epochs, settings.seed, settings.threads)
@@ -110,7 +115,7 @@ def run_once(name: str, frame: Path, bundle: Bundle, settings: Settings) -> Seco
             job += ["--", str(frame)]
         began = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-m", *job],
+            [sys.executable, *launcher, *job],
             capture_output=True,
             text=True,
             check=False,
