@@ -105,9 +105,9 @@ def test_a_loss_is_a_missed_crop_in_a_hundred_or_an_angle_beyond_what_runs_diffe
     floating[:, DETECTION], floating[:, ANGLE] = 0.99, [1.0, 40.0]
     results = np.tile(floating, (2, 2, 1, 1))
     results[0, 0, 0, DETECTION] = 0.975  # lost: more than a hundredth
-    results[0, 1, 0, ANGLE] = 1.2  # kept: less than a quarter of a degree
-    results[1, 0, 0, ANGLE] = 1.3  # lost
-    results[1, 1, 1, ANGLE] = 90  # kept: a round object has no angle
+    results[0, 1, 0, ANGLE] = 1.09  # kept: less than a tenth of a degree
+    results[1, 0, 0, ANGLE] = 1.11  # lost
+    results[1, 1, 1, ANGLE] = 43  # kept: less than a tenth of the error
     results[0, 0, 0, WARNED] = results[1, 1, 1, WARNED] = 1
     report = made_up(results, floating, bundle)
     assert np.argwhere(report.lost).tolist() == [[0, 0, 0], [1, 0, 0]]

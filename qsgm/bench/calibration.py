@@ -63,8 +63,9 @@ DARK = 0.25  # times the brightness
 PLAIN_TABLES = ("plain", "gradient")
 NOISE_FRAMES = 4
 OWN_RUN, OWN_CROPS = "the object itself", "its crops, anew"  # by --recalibrate
-# A frame has lost accuracy to quantization if it is off by more than runs differ anyway.
-LOST_DETECTION, LOST_ANGLE_DEG, LOST_ANGLE_SHARE = 0.01, 0.25, 0.15
+# A frame has lost accuracy to quantization if it is off by more than this. Runs whose gradients
+# agree differ by up to 0.05 degrees from the float one, of round objects too.
+LOST_DETECTION, LOST_ANGLE_DEG, LOST_ANGLE_SHARE = 0.01, 0.1, 0.1
 # of one run, in this order
 METRICS = (
     "cos_int8_float",  # the lowest of any SGM, mean over the run
@@ -142,10 +143,8 @@ class CalibrationReport:
         """Which runs lost accuracy to quantization: (sources, variants, frames)."""
         angle, reference = self.results[..., ANGLE], self.floating[:, ANGLE]
         margin = np.maximum(LOST_ANGLE_DEG, LOST_ANGLE_SHARE * reference)
-        # A round object's angle means nothing.
-        judged = np.array([frame.elongated is not False for frame in self.frames])
         missed = self.floating[:, DETECTION] - self.results[..., DETECTION] > LOST_DETECTION
-        return np.asarray(missed | (judged & (angle > reference + margin)))
+        return np.asarray(missed | (angle > reference + margin))
 
     @property
     def elongated(self) -> NDArray[np.bool_]:
