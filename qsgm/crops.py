@@ -98,11 +98,14 @@ def cut_crops(frame: NDArray[np.uint8], plan: CropPlan) -> NDArray[np.uint8]:
     """
     crops = np.empty((len(plan), CROP_PX, CROP_PX, 3), dtype=np.uint8)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    # OpenCV 5 warps four channels in less than half the time of three (4.10 in a little less), to
+    # the same numbers.
+    wide = cv2.cvtColor(frame, cv2.COLOR_BGR2BGRA)
     for crop, window, color in zip(crops, _windows(plan), plan.color, strict=True):
         cut = cv2.warpAffine(
-            frame, window, (CROP_PX, CROP_PX), flags=flags, borderMode=cv2.BORDER_REFLECT_101
+            wide, window, (CROP_PX, CROP_PX), flags=flags, borderMode=cv2.BORDER_REFLECT_101
         )
-        cv2.transform(cut, color, dst=crop)
+        cv2.transform(cv2.cvtColor(cut, cv2.COLOR_BGRA2BGR), color, dst=crop)
     return crops
 
 

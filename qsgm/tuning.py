@@ -48,6 +48,8 @@ class StepLoop:
             for name in names
         }
         self._state = [_buffers(start), _buffers(start)]
+        # Written by every step: asking a binding for its outputs takes longer than many a node.
+        self._loss = np.zeros((), dtype=np.float32)
         self._bindings = [self._bind(0, 1), self._bind(1, 0)]
         self._now = 0
 
@@ -62,7 +64,7 @@ class StepLoop:
         binding.bind_cpu_input("rows", rows)
         self._session.run_with_iobinding(binding)
         self._now = 1 - self._now
-        return float(binding.get_outputs()[-1].numpy())
+        return float(self._loss)
 
     def weights(self) -> dict[str, Array]:
         """A copy of the weights and biases as they are now."""
@@ -76,7 +78,7 @@ class StepLoop:
         for name in self._state[source]:
             binding.bind_ortvalue_input(name, self._state[source][name])
             binding.bind_ortvalue_output(name + NEXT, self._state[target][name])
-        binding.bind_output("loss", "cpu")  # the last one bound is the last of get_outputs
+        binding.bind_ortvalue_output("loss", ort.OrtValue.ortvalue_from_numpy(self._loss))
         return binding
 
 

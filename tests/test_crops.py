@@ -138,6 +138,19 @@ def test_negatives_come_from_the_whole_frame() -> None:
         assert side.sum() > 5
 
 
+def test_turned_crops_are_what_opencv_makes_of_a_frame_of_three_channels() -> None:
+    frame, turn = noise_frame(), 0.7
+    crop = cut_crops(frame, single_crop_plan((100, 90), turn))[0]
+    cos, sin = math.cos(turn), math.sin(turn)
+    window = np.array([[cos, -sin, 100 - 64 * (cos - sin)], [sin, cos, 90 - 64 * (sin + cos)]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    expected = cv2.warpAffine(
+        frame, window, (CROP_PX, CROP_PX), flags=flags, borderMode=cv2.BORDER_REFLECT_101
+    )
+    # The plan has the angle in float32, which may round a pixel the other way.
+    assert np.abs(crop.astype(int) - expected).max() <= 1
+
+
 def test_outside_the_frame_its_content_is_mirrored() -> None:
     frame = np.full((*FRAME_HW, 3), 77, dtype=np.uint8)
     corner = cut_crops(frame, single_crop_plan((64, 64), math.pi / 4))[0]

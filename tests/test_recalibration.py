@@ -50,9 +50,12 @@ def random_seen(rng: np.random.Generator, side: int) -> FloatArray:
 def write_graph(q: QuantizedSgm, side: int, folder: Path) -> Path:
     """The SGM alone as a graph, its constants in a file beside it."""
     graph = Graph("sgm")
-    seen = graph.input("seen", np.float32, ("batch", side**2, len(q.input_low)))
-    gradient = int8_sgm(graph.within(f"layer{q.layer}"), q, side, seen)
-    graph.output("gradient", gradient, np.float32, ("batch", side**2, len(q.products[-1].bias)))
+    op = graph.within(f"layer{q.layer}")
+    shape = side**2, len(q.products[-1].bias)
+    maps = graph.input("seen", np.float32, ("batch", side**2, len(q.input_low)))
+    seen = op.Reshape(maps, op.shape(-1, len(q.input_low)))
+    gradient = op.Reshape(int8_sgm(op, q, side, seen), op.shape(-1, *shape))
+    graph.output("gradient", gradient, np.float32, ("batch", *shape))
     model, shared = graph.model(), SharedConstants("weights.bin")
     shared.take_from([model])
     (folder / "weights.bin").write_bytes(shared.data)

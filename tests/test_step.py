@@ -19,7 +19,9 @@ from qsgm.folded import FoldedSgm
 from qsgm.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv, run_folded_sgm
+from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import integer_operators, refuse_float_products
+from qsgm.train.graphs.layers import is_positive
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
@@ -261,6 +263,17 @@ def compare_runs(net: FoldedNet, blocks: Blocks, optimizer: Optimizer, steps: in
     assert max(moved) > 5e-3
     assert min(moved) > 1e-6
     assert exported.feeds.get("step", steps) == steps
+
+
+def test_a_gate_is_one_above_zero_and_else_zero_however_small_or_large_a_number_is() -> None:
+    graph = Graph("gate")
+    op, x = graph.within("gate"), graph.input("x", np.float32, ("numbers",))
+    graph.output("gates", is_positive(op, x), np.float32, ("numbers",))
+    limits = np.finfo(np.float32)
+    sizes = np.float32([limits.tiny, 1e-30, 1, 1e30, limits.max, np.inf])
+    numbers = np.concatenate([[0, -0.0], sizes, -sizes], dtype=np.float32)
+    gates = session(graph.model()).run(None, {"x": numbers})[0]
+    np.testing.assert_array_equal(gates, numbers > 0)
 
 
 def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:

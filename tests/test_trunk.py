@@ -256,8 +256,9 @@ def test_a_step_trains_on_u8_features_as_on_their_values_in_float(
     values = codes * net.feature_steps[6 - tuned]
     plain = replace(net, feature_steps={})
     expected = run(step_model(plain, blocks, sgms, loss, Sgd()), features=values, **feeds)
+    # Not bit for bit: the graph multiplies the weights, not the codes, with the steps.
     for one, other in zip(got, expected, strict=True):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("tuned", range(1, 6))
@@ -266,7 +267,7 @@ def test_a_head_sees_u8_features_as_their_values_in_float(net: FoldedNet, tuned:
     got = run(head_model(net, tuned, "double"), features=codes, **start(net, tuned))
     values, plain = codes * net.feature_steps[6 - tuned], replace(net, feature_steps={})
     expected = run(head_model(plain, tuned, "double"), features=values, **start(net, tuned))
-    np.testing.assert_array_equal(got[0], expected[0])
+    np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-5)
 
 
 def random_batch(

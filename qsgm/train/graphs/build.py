@@ -11,6 +11,7 @@ runtime since 2022, and the default domain is the only one.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -135,6 +136,22 @@ class Ops:
     def shape(self, *sizes: int) -> Value:
         """A shape for Reshape and its like; -1: whatever is left, 0: as it was."""
         return self.graph.constant(sizes, np.int64)
+
+
+@dataclass(frozen=True)
+class Product:
+    """A matrix product that is not in the graph yet: what is added to it costs no node."""
+
+    left: Value
+    right: Value
+    turned: bool = False  # whether the left one is to be transposed
+
+    def alone(self, op: Ops) -> Value:
+        return op.Gemm(self.left, self.right, transA=int(self.turned))
+
+    def plus(self, op: Ops, value: Value, factor: float) -> Value:
+        """The product plus `factor` times a value of its shape."""
+        return op.Gemm(self.left, self.right, value, transA=int(self.turned), beta=factor)
 
 
 def _value_info(name: str, dtype: DTypeLike, shape: Sequence[Dimension]) -> onnx.ValueInfoProto:

@@ -1,25 +1,33 @@
 """One tuned layer in a graph: the arithmetic of :mod:`qsgm.train.local`.
 
-Activations are position-major, (B, P, C). A convolution is a gather of windows (im2col) and one
-matrix product, and its weight gradient is another product with the same windows: a Conv whose
-weight is an input, or a Conv for the gradient, takes several times as long in ONNX Runtime. Back
-to a layer's input it is the other way round: ConvTranspose takes a fifth to a half of the time of
-gathering or scattering the windows' gradients.
+Activations are matrices, (B * P, C): a row per crop and position. A convolution is a gather of
+windows (im2col) and one matrix product, and its weight gradient is another product with the same
+windows: a Conv whose weight is an input, or a Conv for the gradient, takes several times as long in
+ONNX Runtime. Back to a layer's input it is the other way round: ConvTranspose takes a fifth to a
+half of the time of gathering or scattering the windows' gradients.
+
+At this size every node counts, about a microsecond each. Hence the order of ReLU and Reshape, which
+lets the runtime put ReLU into the product, and products to which an optimizer adds.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 from onnx import TensorProto
 
 from qsgm.blocks import tuned_layers
 from qsgm.train.curvature import Curvature
 from qsgm.train.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
-from qsgm.train.graphs.build import Graph, Ops, Value
+from qsgm.train.graphs.build import Graph, Ops, Product, Value
+from qsgm.train.graphs.optimizers import Gradient
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
+# Times the smallest normal float32 this is above 1.
+STEEP = 1e38
+
+FloatArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,7 @@ class TunedLayer:
     side: int  # its input map is side x side
     weight: Value  # (Co, kh * kw * Ci)
     bias: Value  # (Co,)
+    steps: FloatArray | None  # (kh * kw * Ci,), where its windows are codes: what one stands for
 
     @property
     def kernel(self) -> int:
@@ -65,9 +74,9 @@ class TunedLayer:
 class Batch:
     """The crops of one step, picked by `rows` from all crops."""
 
-    features: Value  # (B, P, C)
+    features: Value  # (B * P, C)
     labels: Value  # (B, 3)
-    share: Value  # 1 / B
+    size: Value  # B, a float32 scalar
 
 
 @dataclass(frozen=True)
@@ -75,8 +84,8 @@ class Pass:
     """What a layer's forward pass leaves for its update."""
 
     windows: Value  # (B * P, K)
-    before: Value  # (B, P, Co), before ReLU
-    after: Value  # (B, P', Co), behind ReLU and pool
+    active: Value  # (B * P, Co), behind ReLU
+    after: Value  # (B * P', Co), behind the pool
 
 
 def output_side(side: int, kernel: int, stride: int) -> int:
@@ -100,7 +109,10 @@ def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]
         shape = to_step_layout(folded.weight).shape
         weight = graph.input(f"weight{number}", np.float32, shape)
         bias = graph.input(f"bias{number}", np.float32, shape[:1])
-        layers.append(TunedLayer(number, folded, input_side(net, number), weight, bias))
+        steps = None
+        if number == tuned_layers(tuned)[0] and number - 1 in net.feature_steps:
+            steps = np.tile(net.feature_steps[number - 1], folded.weight[0, 0].size)
+        layers.append(TunedLayer(number, folded, input_side(net, number), weight, bias, steps))
     return layers
 
 
@@ -117,18 +129,17 @@ def features_dtype(net: FoldedNet, last_frozen: int) -> DTypeLike:
 
 
 def as_seen(op: Ops, net: FoldedNet, features: Value, tuned: int) -> Value:
-    """Features as the first tuned layer sees them: float32, pixels in [-1, 1]."""
+    """Features (B, P, C) as the first tuned layer sees them, (B * P, C) in float32.
+
+    Pixels are in [-1, 1]. Codes stay what they are: it is quicker to give their steps to the
+    weights, of which there are fewer.
+    """
     number = tuned_layers(tuned)[0]
+    rows = op.Reshape(features, op.shape(-1, net.layers[number - 1].weight.shape[1]))
     if features_dtype(net, number - 1) != np.uint8:
-        return features
-    codes = op.Cast(features, to=TensorProto.FLOAT)
-    if number == 1:
-        return normalized(op, codes)
-    # DequantizeLinear with a step per channel would make a training step a fifth longer. This is
-    # as quick as float32 features: the runtime writes out steps for every position when it loads.
-    steps = net.feature_steps[number - 1]
-    positions = input_side(net, number) ** 2
-    return op.Mul(codes, op.Expand(op.constant(steps), op.shape(positions, len(steps))))
+        return rows
+    codes = op.Cast(rows, to=TensorProto.FLOAT)
+    return normalized(op, codes) if number == 1 else codes
 
 
 def normalized(op: Ops, pixels: Value) -> Value:
@@ -142,9 +153,9 @@ def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
     labels = graph.input("labels", np.float32, ("crops", 3))
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
-    share = op.Reciprocal(op.Cast(op.Size(rows), to=TensorProto.FLOAT))
+    size = op.Cast(op.Size(rows), to=TensorProto.FLOAT)
     seen = as_seen(op, net, op.Gather(features, rows, axis=0), tuned)
-    return Batch(seen, op.Gather(labels, rows, axis=0), share)
+    return Batch(seen, op.Gather(labels, rows, axis=0), size)
 
 
 def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Value:
@@ -158,57 +169,91 @@ def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Va
 
 
 def cut_windows(op: Ops, layer: TunedLayer, x: Value) -> Value:
-    """The windows (B * P, K) that a layer sees of its input (B, P_in, Ci)."""
-    if layer.kernel > 1:
-        x = gather_windows(op, x, layer.side, layer.kernel, layer.folded.stride)
-    return op.Reshape(x, op.shape(-1, layer.width))
+    """The windows (B * P, K) that a layer sees of its input (B * P_in, Ci)."""
+    if layer.kernel == 1:
+        return x
+    maps = op.Reshape(x, op.shape(-1, layer.side**2, layer.folded.weight.shape[1]))
+    windows = gather_windows(op, maps, layer.side, layer.kernel, layer.folded.stride)
+    return op.Reshape(windows, op.shape(-1, layer.width))
 
 
 def forward(op: Ops, layer: TunedLayer, x: Value) -> Pass:
-    """Input (B, P_in, Ci) through convolution, ReLU and pool."""
-    seen = cut_windows(op, layer, x)
-    flat = op.Gemm(seen, layer.weight, layer.bias, transB=1)
-    before = op.Reshape(flat, op.shape(-1, layer.positions, layer.channels))
-    after = op.Relu(before) if layer.folded.relu else before
-    if layer.folded.pool > 1:  # of a crop, the pool covers the whole map
-        after = op.ReduceMean(after, axes=[1], keepdims=1)
-    return Pass(seen, before, after)
+    """Input (B * P_in, Ci) through convolution, ReLU and pool."""
+    seen, weight = cut_windows(op, layer, x), layer.weight
+    if layer.steps is not None:
+        weight = op.Mul(weight, op.constant(layer.steps))
+    active = op.Gemm(seen, weight, layer.bias, transB=1)
+    if layer.folded.relu:
+        active = op.Relu(active)
+    if layer.folded.pool == 1:
+        return Pass(seen, active, active)
+    # Of a crop, the pool covers the whole map.
+    return Pass(seen, active, op.ReduceMean(as_maps(op, layer, active), axes=[1], keepdims=0))
+
+
+def as_maps(op: Ops, layer: TunedLayer, x: Value) -> Value:
+    """Rows (B * P, Co) of a layer's output in front of its pool, crop by crop: (B, P, Co)."""
+    return op.Reshape(x, op.shape(-1, layer.positions, layer.channels))
 
 
 def through_activation(op: Ops, layer: TunedLayer, done: Pass, gradient: Value) -> Value:
-    """A gradient on the layer's activation (B, P', C) carried back to `before`: (B * P, C)."""
+    """A gradient on the layer's activation (B * P', C) carried back through it: (B * P, C)."""
     if layer.folded.pool > 1:
-        gradient = op.Mul(gradient, op.constant(1 / layer.positions))
+        share = op.Mul(gradient, op.constant(1 / layer.positions))
+        gradient = at_every_position(op, share, layer.positions, layer.channels)
     if layer.folded.relu:
-        gradient = op.Where(op.Greater(done.before, op.constant(0.0)), gradient, op.constant(0.0))
-    return op.Reshape(gradient, op.shape(-1, layer.channels))
+        gradient = op.Mul(gradient, is_positive(op, done.active))
+    return gradient
 
 
-def weight_gradients(op: Ops, done: Pass, dz: Value) -> tuple[Value, Value]:
-    """Gradients of weight and bias, summed over all rows of dz (B * P, C)."""
-    return op.Gemm(dz, done.windows, transA=1), op.ReduceSum(dz, op.shape(0), keepdims=0)
+def at_every_position(op: Ops, x: Value, positions: int, channels: int) -> Value:
+    """Rows (B, C), each so many times: (B * P, C)."""
+    return op.Reshape(op.Tile(x, op.shape(1, positions)), op.shape(-1, channels))
 
 
-def bend(
-    op: Ops, layer: TunedLayer, curvature: Curvature, d_weight: Value, d_bias: Value
-) -> tuple[Value, Value]:
-    """Gradients (Co, K) and (Co,) along the layer's curvature, as `Curvature.bend` has them."""
+def is_positive(op: Ops, x: Value) -> Value:
+    """1 where a number is above zero, else 0, in float32.
+
+    Nothing lies between in a sigmoid so steep. It takes one node where Greater and Cast take two;
+    Where in the place of Cast and a product takes three times as long.
+    """
+    return op.HardSigmoid(x, alpha=STEEP, beta=0.0)
+
+
+def weight_gradients(
+    op: Ops, layer: TunedLayer, done: Pass, dz: Value
+) -> tuple[Gradient, Gradient]:
+    """Gradients of weight (Co, K) and bias (1, Co), summed over all rows of dz (B * P, C)."""
+    d_weight = Product(dz, done.windows, turned=True)
+    d_bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
+    if layer.steps is None:
+        return d_weight, d_bias
+    return op.Mul(d_weight.alone(op), op.constant(layer.steps)), d_bias
+
+
+def bent_gradients(
+    op: Ops, layer: TunedLayer, done: Pass, dz: Value, curvature: Curvature
+) -> tuple[Gradient, Gradient]:
+    """:func:`weight_gradients` along the layer's curvature, as `Curvature.bend` has them."""
     window, into, out, bias = (matrix.numpy() for matrix in curvature.matrices)
+    if layer.steps is not None:  # where they cost no node
+        into = layer.steps[: len(into), None] * into
+    d_weight = Product(dz, done.windows, turned=True).alone(op)
     if layer.kernel == 1:  # one position: its factor goes with another matrix
         windows = op.MatMul(d_weight, op.constant(window[0, 0] * into))
     else:
         maps = op.Reshape(d_weight, op.shape(layer.channels, len(window), len(into)))
         windows = op.MatMul(op.constant(window.T), op.MatMul(maps, op.constant(into)))
         windows = op.Reshape(windows, op.shape(layer.channels, layer.width))
-    return op.MatMul(op.constant(out.T), windows), op.MatMul(d_bias, op.constant(bias))
+    d_bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
+    return Product(op.constant(out.T), windows), Product(d_bias, op.constant(bias))
 
 
 def gradient_before(op: Ops, layer: TunedLayer, dz: Value) -> Value:
-    """dz (B * P, C) carried back to the layer's input: (B, P_in, Ci)."""
+    """dz (B * P, C) carried back to the layer's input: (B * P_in, Ci)."""
     into, kernel, side = layer.folded.weight.shape[1], layer.kernel, layer.side
-    as_input = op.shape(-1, side**2, into)
     if kernel == 1:
-        return op.Reshape(op.Gemm(dz, layer.weight), as_input)
+        return op.Gemm(dz, layer.weight)
     weight = op.Reshape(layer.weight, op.shape(-1, kernel, kernel, into))
     maps = op.Reshape(dz, op.shape(-1, layer.before_side, layer.before_side, layer.channels))
     unseen = (side - kernel) % layer.folded.stride  # rows that no window reaches
@@ -219,4 +264,4 @@ def gradient_before(op: Ops, layer: TunedLayer, dz: Value) -> Value:
         strides=(layer.folded.stride, layer.folded.stride),
         output_padding=(unseen, unseen),
     )
-    return op.Reshape(op.Transpose(before, perm=(0, 2, 3, 1)), as_input)
+    return op.Reshape(op.Transpose(before, perm=(0, 2, 3, 1)), op.shape(-1, into))

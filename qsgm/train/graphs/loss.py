@@ -12,11 +12,14 @@ def channels(op: Ops, x: Value, start: int, stop: int) -> Value:
 
 def activate(op: Ops, raw: Value, encoding: AngleEncoding) -> tuple[Value, Value]:
     """Raw outputs (B, 3, ...) to quality in (0, 1), (B, 1, ...), and sine, cosine (B, 2, ...)."""
-    quality = op.Sigmoid(channels(op, raw, 0, 1))
+    return op.Sigmoid(channels(op, raw, 0, 1)), turned(op, channels(op, raw, 1, 3), encoding)
+
+
+def turned(op: Ops, raw: Value, encoding: AngleEncoding) -> Value:
+    """Raw outputs (B, 2, ...) of the angle to its sine and cosine."""
     if encoding == "double":
-        return quality, op.Tanh(channels(op, raw, 1, 3))
-    sine, cosine = op.Tanh(channels(op, raw, 1, 2)), op.Sigmoid(channels(op, raw, 2, 3))
-    return quality, op.Concat(sine, cosine, axis=1)
+        return op.Tanh(raw)
+    return op.Concat(op.Tanh(channels(op, raw, 0, 1)), op.Sigmoid(channels(op, raw, 1, 2)), axis=1)
 
 
 def angle_slope(op: Ops, angle: Value, encoding: AngleEncoding) -> Value:
@@ -31,17 +34,20 @@ def angle_slope(op: Ops, angle: Value, encoding: AngleEncoding) -> Value:
 
 def loss_and_error(op: Ops, loss: Loss, raw: Value, labels: Value) -> tuple[Value, Value]:
     """Mean loss, a scalar, and each sample's d loss / d raw outputs (B, 3); both inputs (B, 3)."""
-    label, smoothing = channels(op, labels, 0, 1), loss.label_smoothing
+    # Each slice is taken once: the runtime then makes one node of those of a tensor.
+    logit, raw_angle = channels(op, raw, 0, 1), channels(op, raw, 1, 3)
+    label, direction = channels(op, labels, 0, 1), channels(op, labels, 1, 3)
+    smoothing = loss.label_smoothing
     target = op.Add(op.Mul(label, op.constant(1 - smoothing)), op.constant(smoothing / 2))
-    quality, angle = activate(op, raw, loss.encoding)
-    miss = op.Sub(angle, channels(op, labels, 1, 3))
-    weight = op.Mul(label, op.constant(loss.angle_weight))  # of the angle; negatives have none
+    angle = turned(op, raw_angle, loss.encoding)
+    miss = op.Sub(angle, direction)
+    # The derivative of the angle's loss by the angle; negatives have none.
+    pull = op.Mul(op.Mul(label, op.constant(2 * loss.angle_weight)), miss)
 
-    logit = channels(op, raw, 0, 1)
     log_loss = op.Sub(op.Softplus(logit), op.Mul(target, logit))
-    squared = op.ReduceSum(op.Mul(miss, miss), op.shape(1), keepdims=1)
-    mean = op.ReduceMean(op.Add(log_loss, op.Mul(weight, squared)), keepdims=0)
+    # Half of pull * miss, summed over sine and cosine, is their mean.
+    means = (op.ReduceMean(x, keepdims=0) for x in (log_loss, op.Mul(pull, miss)))
 
-    angle_error = op.Mul(op.Mul(op.constant(2.0), miss), angle_slope(op, angle, loss.encoding))
-    error = op.Concat(op.Sub(quality, target), op.Mul(weight, angle_error), axis=1)
-    return mean, error
+    logit_error = op.Sub(op.Sigmoid(logit), target)
+    angle_error = op.Mul(pull, angle_slope(op, angle, loss.encoding))
+    return op.Add(*means), op.Concat(logit_error, angle_error, axis=1)

@@ -11,10 +11,11 @@ from typing import Protocol
 import numpy as np
 from onnx import TensorProto
 
-from qsgm.train.graphs.build import Graph, Ops, Value
+from qsgm.train.graphs.build import Graph, Ops, Product, Value
 
+Gradient = Product | Value
 # (operators, value, its moments, gradient, rate) -> next value, next moments
-Rule = Callable[[Ops, Value, Sequence[Value], Value, Value], tuple[Value, Sequence[Value]]]
+Rule = Callable[[Ops, Value, Sequence[Value], Gradient, Value], tuple[Value, Sequence[Value]]]
 
 
 class Optimizer(Protocol):
@@ -40,13 +41,11 @@ class Sgd:
     def moments(self) -> tuple[str, ...]:
         return ("momentum",)
 
-    def rule(self, graph: Graph) -> Rule:
-        decay = graph.constant(self.momentum)
-
+    def rule(self, graph: Graph) -> Rule:  # noqa: ARG002
         def update(
-            op: Ops, value: Value, moments: Sequence[Value], gradient: Value, rate: Value
+            op: Ops, value: Value, moments: Sequence[Value], gradient: Gradient, rate: Value
         ) -> tuple[Value, Sequence[Value]]:
-            momentum = op.Add(op.Mul(moments[0], decay), gradient)
+            momentum = _plus(op, gradient, moments[0], self.momentum)
             return op.Sub(value, op.Mul(rate, momentum)), (momentum,)
 
         return update
@@ -76,16 +75,29 @@ class Adam:
         square_correction = op.Sqrt(_correction(op, self.square_decay, step))
 
         def update(
-            op: Ops, value: Value, moments: Sequence[Value], gradient: Value, rate: Value
+            op: Ops, value: Value, moments: Sequence[Value], gradient: Gradient, rate: Value
         ) -> tuple[Value, Sequence[Value]]:
-            mean = _decayed(op, moments[0], gradient, self.mean_decay)
-            square = _decayed(op, moments[1], op.Mul(gradient, gradient), self.square_decay)
+            new = value_of(op, gradient)
+            mean = _decayed(op, moments[0], new, self.mean_decay)
+            square = _decayed(op, moments[1], op.Mul(new, new), self.square_decay)
             root = op.Div(op.Sqrt(square), square_correction)
             direction = op.Div(mean, op.Add(root, op.constant(self.epsilon)))
             step_size = op.Div(rate, mean_correction)
             return op.Sub(value, op.Mul(step_size, direction)), (mean, square)
 
         return update
+
+
+def value_of(op: Ops, gradient: Gradient) -> Value:
+    """The gradient itself."""
+    return gradient.alone(op) if isinstance(gradient, Product) else gradient
+
+
+def _plus(op: Ops, gradient: Gradient, moment: Value, decay: float) -> Value:
+    """The gradient plus the moment times `decay`."""
+    if isinstance(gradient, Product):
+        return gradient.plus(op, moment, decay)
+    return op.Add(op.Mul(moment, op.constant(decay)), gradient)
 
 
 def _decayed(op: Ops, moment: Value, new: Value, decay: float) -> Value:

@@ -11,7 +11,7 @@ from qsgm.errors import QsgmError
 from qsgm.folded import FoldedSgm
 from qsgm.quantize import QuantizedSgm
 from qsgm.train.fold import FoldedNet
-from qsgm.train.graphs.build import Graph, Value
+from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import (
     Batch,
     Pass,
@@ -25,6 +25,7 @@ from qsgm.train.graphs.layers import (
     weight_gradients,
 )
 from qsgm.train.graphs.loss import activate, loss_and_error
+from qsgm.train.graphs.optimizers import value_of
 from qsgm.train.graphs.sgm import (
     clipped_fraction,
     float_sgm,
@@ -80,7 +81,7 @@ def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProt
     op = graph.within("head")
     features = as_seen(op, net, declare_features(graph, net, tuned), tuned)
     passes = forward_all(graph, layers, features)
-    activated = activate(op, op.Squeeze(passes[-1].after, op.shape(1)), encoding)
+    activated = activate(op, passes[-1].after, encoding)
     graph.output("outputs", op.Concat(*activated, axis=1), np.float32, ("crops", 3))
     return graph.model()
 
@@ -91,14 +92,11 @@ def probe_truth(
     """Declare `true{k}` of every layer but the last; returns them by layer."""
     truth = {}
     op = graph.within("truth")
-    raw = op.Squeeze(passes[-1].after, op.shape(1))
-    _, error = loss_and_error(op, loss, raw, batch.labels)
-    gradient = op.Unsqueeze(error, op.shape(1))
+    _, gradient = loss_and_error(op, loss, passes[-1].after, batch.labels)
     for layer, done, before in list(zip(layers[1:], passes[1:], layers, strict=False))[::-1]:
         op = graph.within(f"layer{layer.number}/back")
         gradient = gradient_before(op, layer, through_activation(op, layer, done, gradient))
-        shape = "batch", before.after_side**2, before.channels
-        graph.output(f"true{before.number}", gradient, np.float32, shape)
+        report_maps(op, f"true{before.number}", gradient, before)
         truth[before.number] = gradient
     return truth
 
@@ -113,20 +111,26 @@ def probe_sgm(
 ) -> dict[str, Value]:
     """Declare `activation{k}`, `float{k}`, `int8{k}`, `clipped{k}` of a layer; both gradients."""
     number, side = layer.number, layer.after_side
-    shape = "batch", side**2, layer.channels
     op = graph.within(f"layer{number}/float")
     seen = sgm_inputs(op, done.after, side, batch)
-    graph.output(f"activation{number}", done.after, np.float32, shape)
+    report_maps(op, f"activation{number}", done.after, layer)
     floating = float_sgm(op, float_one, side, seen)
-    graph.output(f"float{number}", floating, np.float32, shape)
+    report_maps(op, f"float{number}", floating, layer)
     op = graph.within(f"layer{number}/int8")
     int8 = int8_sgm(op, int8_one, side, seen)
-    graph.output(f"int8{number}", int8, np.float32, shape)
+    report_maps(op, f"int8{number}", int8, layer)
     clipped = clipped_fraction(op, int8_one, scaled_inputs(op, int8_one, seen))
     graph.output(f"clipped{number}", clipped, np.float32, ())
     underflow = underflow_fraction(op, int8_one, seen)
     graph.output(f"underflow{number}", underflow, np.float32, ())
     return {"float": floating, "int8": int8}
+
+
+def report_maps(op: Ops, name: str, rows: Value, layer: TunedLayer) -> None:
+    """Declare rows (B * P, C) behind a layer as an output, crop by crop: (B, P, C)."""
+    positions = layer.after_side**2
+    maps = op.Reshape(rows, op.shape(-1, positions, layer.channels))
+    op.graph.output(name, maps, np.float32, ("batch", positions, layer.channels))
 
 
 def probe_updates(
@@ -135,7 +139,8 @@ def probe_updates(
     """Declare `update_true{k}` and so on: what a layer would make of each of its gradients."""
     for name, gradient in gradients.items():
         op = graph.within(f"layer{layer.number}/update_{name}")
-        d_weight, d_bias = weight_gradients(op, done, through_activation(op, layer, done, gradient))
-        update = op.Concat(d_weight, op.Unsqueeze(d_bias, op.shape(1)), axis=1)
+        dz = through_activation(op, layer, done, gradient)
+        d_weight, d_bias = (value_of(op, one) for one in weight_gradients(op, layer, done, dz))
+        update = op.Concat(d_weight, op.Transpose(d_bias, perm=(1, 0)), axis=1)
         shape = layer.channels, layer.width + 1
         graph.output(f"update_{name}{layer.number}", update, np.float32, shape)

@@ -1,7 +1,7 @@
 """A static SGM in a graph, in float and in int8.
 
-Both take what the SGM sees, a map position by position, (B, P, Ci), and answer with gradients
-(B, P, C). Behind layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product.
+Both take what the SGM sees, a row per crop and position, (B * P, Ci), and answer with gradients
+(B * P, C). Behind layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product.
 Behind layers 1 to 3 they differ: in float the weights are constants, so that a Conv is quickest;
 ONNX Runtime has no integer Conv with a float result, so int8 cuts windows for a matrix product.
 """
@@ -10,6 +10,7 @@ import numpy as np
 
 from qsgm.folded import FoldedSgm
 from qsgm.quantize import (
+    LABELS,
     UNDERFLOW_STEPS,
     Codes,
     QuantizedProduct,
@@ -18,13 +19,13 @@ from qsgm.quantize import (
     constants,
 )
 from qsgm.train.graphs.build import Ops, Value
-from qsgm.train.graphs.layers import Batch, gather_windows
+from qsgm.train.graphs.layers import Batch, at_every_position, gather_windows
 
 
 def sgm_gradient(
     op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, batch: Batch
 ) -> Value:
-    """The gradient (B, P, C) that the SGM gives for an activation of as many, P = side * side."""
+    """The gradient (B * P, C) that the SGM gives for an activation of as many, P = side * side."""
     seen = sgm_inputs(op, after, side, batch)
     if isinstance(sgm, QuantizedSgm):
         return int8_sgm(op, sgm, side, seen)
@@ -32,25 +33,27 @@ def sgm_gradient(
 
 
 def sgm_inputs(op: Ops, after: Value, side: int, batch: Batch) -> Value:
-    """Activation (B, P, C) and label, the same at every position, side by side: (B, P, Ci)."""
-    labels = op.Unsqueeze(batch.labels, op.shape(1))
-    return op.Concat(after, op.Expand(labels, op.shape(1, side**2, 1)), axis=2)
+    """Activation (B * P, C) and label, the same at every position: side by side, (B * P, Ci)."""
+    labels = batch.labels
+    if side > 1:
+        labels = at_every_position(op, labels, side**2, LABELS)
+    return op.Concat(after, labels, axis=1)
 
 
 def float_sgm(op: Ops, sgm: FoldedSgm, side: int, seen: Value) -> Value:
-    """Inputs (B, P, Ci) through all convolutions, with ReLU between: (B, P, C)."""
+    """Inputs (B * P, Ci) through all convolutions, with ReLU between: (B * P, C)."""
     inputs, channels = sgm.convs[0].weight.shape[1], len(sgm.convs[-1].bias)
+    x = seen
     if sgm.kernel == 1:
-        x = op.Reshape(seen, op.shape(-1, inputs))
         for i, conv in enumerate(sgm.convs):
             weight, bias = op.constant(conv.weight[:, :, 0, 0]), op.constant(conv.bias)
             x = op.Gemm(op.Relu(x) if i else x, weight, bias, transB=1)
-        return op.Reshape(x, op.shape(-1, side**2, channels))
+        return x
     x = op.Transpose(op.Reshape(seen, op.shape(-1, side, side, inputs)), perm=(0, 3, 1, 2))
     for i, conv in enumerate(sgm.convs):
         weight, bias = op.constant(conv.weight), op.constant(conv.bias)
         x = op.Conv(op.Relu(x) if i else x, weight, bias, pads=[sgm.kernel // 2] * 4)
-    return op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, side**2, channels))
+    return op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, channels))
 
 
 def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
@@ -60,8 +63,7 @@ def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
     product, where they have a code of their own, and the code 0 in front of the others.
     """
     declare_constants(op, sgm)
-    x = op.Reshape(seen, op.shape(-1, len(sgm.input_low)))
-    x = scaled_inputs(op, sgm, padded(op, x, side, sgm.kernel, len(sgm.input_low)))
+    x = scaled_inputs(op, sgm, padded(op, seen, side, sgm.kernel, len(sgm.input_low)))
     planes = as_planes(op, sgm.codes, x)
     for i, product in enumerate(sgm.products):
         if i > 0:
@@ -73,7 +75,7 @@ def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
             for u8, width in zip(planes, widths, strict=True)
         )
         x = int8_product(op, f"sgm{sgm.layer}/{i}", product, high, both)
-    return op.Reshape(x, op.shape(-1, side**2, len(sgm.products[-1].bias)))
+    return x
 
 
 def padded(op: Ops, x: Value, side: int, kernel: int, channels: int) -> Value:

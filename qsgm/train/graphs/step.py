@@ -23,7 +23,7 @@ from qsgm.train.graphs.layers import (
     Batch,
     Pass,
     TunedLayer,
-    bend,
+    bent_gradients,
     declare_batch,
     declare_layers,
     forward,
@@ -32,7 +32,7 @@ from qsgm.train.graphs.layers import (
     weight_gradients,
 )
 from qsgm.train.graphs.loss import loss_and_error
-from qsgm.train.graphs.optimizers import Optimizer, Rule
+from qsgm.train.graphs.optimizers import Gradient, Optimizer, Rule
 from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graspnet import Loss
 
@@ -75,7 +75,7 @@ def step_model(
         else:
             gradient = report_loss(op, loss, x, batch)
         # Divided by the batch here, where the gradient is smallest: the rest is sums.
-        shared = op.Mul(gradient, batch.share)
+        shared = op.Div(gradient, batch.size)
         update_block(graph, block, passes, shared, curvatures, optimizer, rule)
     return graph.model()
 
@@ -100,10 +100,10 @@ def forward_all(graph: Graph, layers: list[TunedLayer], x: Value) -> list[Pass]:
 
 
 def report_loss(op: Ops, loss: Loss, raw: Value, batch: Batch) -> Value:
-    """Declare the output `loss`; return each sample's error, d loss / d raw outputs (B, 1, 3)."""
-    mean, error = loss_and_error(op, loss, op.Squeeze(raw, op.shape(1)), batch.labels)
+    """Declare the output `loss`; return each sample's error, d loss / d raw outputs (B, 3)."""
+    mean, error = loss_and_error(op, loss, raw, batch.labels)
     op.graph.output("loss", mean, np.float32, ())
-    return op.Unsqueeze(error, op.shape(1))
+    return error
 
 
 def update_block(
@@ -115,30 +115,42 @@ def update_block(
     optimizer: Optimizer,
     rule: Rule,
 ) -> None:
-    """All these layers' updates, from the gradient (B, P', C) on the last one's activation.
+    """All these layers' updates, from the gradient (B * P', C) on the last one's activation.
 
     It is carried back with the weights as they were.
     """
     for layer, done in list(zip(layers, passes, strict=True))[::-1]:
         op = graph.within(f"layer{layer.number}")
         dz = through_activation(op, layer, done, gradient)
-        gradients = weight_gradients(op, done, dz)
         if layer.number in curvatures:
-            gradients = bend(op, layer, curvatures[layer.number], *gradients)
+            gradients = bent_gradients(op, layer, done, dz, curvatures[layer.number])
+        else:
+            gradients = weight_gradients(op, layer, done, dz)
         update_layer(op, layer, *gradients, optimizer, rule)
         if layer is not layers[0]:
             gradient = gradient_before(op, layer, dz)
 
 
 def update_layer(
-    op: Ops, layer: TunedLayer, d_weight: Value, d_bias: Value, optimizer: Optimizer, rule: Rule
+    op: Ops,
+    layer: TunedLayer,
+    d_weight: Gradient,
+    d_bias: Gradient,
+    optimizer: Optimizer,
+    rule: Rule,
 ) -> None:
-    """One layer's update from the gradients (Co, K) and (Co,) of its weight and bias."""
+    """One layer's update from the gradients (Co, K) and (1, Co) of its weight and bias."""
     rate = op.graph.input(f"rate{layer.number}", np.float32, ())
-    for value, kind, d_value in ((layer.weight, "weight", d_weight), (layer.bias, "bias", d_bias)):
-        shape = (layer.channels, layer.width) if kind == "weight" else (layer.channels,)
+
+    def update(value: Value, kind: str, gradient: Gradient, shape: tuple[int, int]) -> Value:
         names = [f"{kind}_{moment}{layer.number}" for moment in optimizer.moments]
         moments = [op.graph.input(name, np.float32, shape) for name in names]
-        next_value, next_moments = rule(op, value, moments, d_value, rate)
-        for name, result in zip([value, *names], [next_value, *next_moments], strict=True):
+        next_value, next_moments = rule(op, value, moments, gradient, rate)
+        for name, result in zip(names, next_moments, strict=True):
             op.graph.output(f"{name}_next", result, np.float32, shape)
+        return next_value
+
+    weight = update(layer.weight, "weight", d_weight, (layer.channels, layer.width))
+    op.graph.output(f"{layer.weight}_next", weight, np.float32, (layer.channels, layer.width))
+    bias = op.Squeeze(update(layer.bias, "bias", d_bias, (1, layer.channels)), op.shape(0))
+    op.graph.output(f"{layer.bias}_next", bias, np.float32, (layer.channels,))
