@@ -363,18 +363,20 @@ def test_run_lengths_that_are_no_numbers_of_epochs_are_refused(
     assert "--short" in message
 
 
-def test_ratios_compare_tuning_with_forward_passes() -> None:
+def test_ratios_compare_whole_jobs_and_steps_that_took_turns() -> None:
     medians = {
         name: {"features": 1.0, "tuning": tuning, "process": 2.0}
         for name, tuning in (("sgm int8", 2.0), ("sgm float", 1.6), ("bp", 3.0), ("torch bp", 5.0))
     }
-    found = ratios(medians, 1.0)
-    assert found["qsgm_step_over_forward"] == 2
+    turns = {"forward": 1.0, "backprop": 3.5, "sgm_float": 2.0, "sgm_int8": 2.5}
+    found = ratios(medians, turns)
+    assert found["qsgm_step_over_forward"] == 2.5
+    assert found["float_step_over_forward"] == 2
     assert found["int8_step_over_float_step"] == 1.25
-    assert found["bp_step_over_qsgm_step"] == 1.5
+    assert found["bp_step_over_qsgm_step"] == 1.4
     assert found["torch_bp_step_over_qsgm_step"] == 2.5
     del medians["torch bp"]
-    assert "torch_bp_step_over_qsgm_step" not in ratios(medians, 1.0)
+    assert "torch_bp_step_over_qsgm_step" not in ratios(medians, turns)
 
 
 def test_speed_runs_the_same_job_in_processes_of_their_own(

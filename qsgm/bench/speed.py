@@ -1,7 +1,8 @@
 """Seconds per stage of the whole job, in processes of their own, next to the same job in torch.
 
 Every variant runs several times, in turns, so that whatever else the machine does hits all of
-them; medians are reported. Ratios are what can be compared between machines.
+them; medians are reported. Single steps and forward passes take turns in one process, a few hundred
+times: they are too short to be compared otherwise. Ratios are what can be compared between machines.
 """
 
 import importlib.util
@@ -16,14 +17,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
 from rich.console import Group, RenderableType
 
-from qsgm.bundle import Bundle, head_file
+from qsgm.bench.resources import step_seconds
+from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import Prepared, Settings, Watch, prepare, trunk_precision
-from qsgm.images import read_demonstration
+from qsgm.finetuning import Settings, Watch, trunk_precision
 from qsgm.report import number, plain_table
 from qsgm.tuning import BATCH
 
@@ -33,6 +33,8 @@ VARIANTS: Mapping[str, Sequence[str]] = {
     "bp": ("--method", "bp"),
 }
 TORCH = "torch bp"
+# Of each kind of step, and of a forward pass.
+TURNS = 400
 STAGES = ("crops", "features", "tuning", "total", "process")
 
 Seconds = dict[str, float]
@@ -54,7 +56,7 @@ def measure_speed(
         for name, some in runs.items()
     }
     steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
-    forward = forward_seconds(prepare(read_demonstration(frame), bundle, settings))
+    turns = step_seconds(bundle, settings.layers, TURNS, settings.threads)
     return {
         "frame": str(frame),
         "bundle": str(bundle.folder),
@@ -71,18 +73,19 @@ def measure_speed(
         "step_ms": {
             name: number(1000 * stages["tuning"] / steps, 4) for name, stages in medians.items()
         },
-        "forward_ms": number(1000 * forward, 4),
-        "ratios": ratios(medians, forward * steps),
+        "in_turns_ms": {name: number(1000 * value, 4) for name, value in turns.items()},
+        "ratios": ratios(medians, turns),
     }
 
 
-def ratios(medians: Mapping[str, Seconds], forward: float) -> dict[str, float | None]:
-    """`forward` is the time of as many forward passes of the tuned layers as there were steps."""
-    own, floating, bp = (medians[name] for name in VARIANTS)
+def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | None]:
+    """Between whole jobs, and between steps and forward passes that took turns."""
+    own, step = medians["sgm int8"], turns["sgm_int8"]
     found = {
-        "qsgm_step_over_forward": own["tuning"] / forward,
-        "int8_step_over_float_step": own["tuning"] / floating["tuning"],
-        "bp_step_over_qsgm_step": bp["tuning"] / own["tuning"],
+        "qsgm_step_over_forward": step / turns["forward"],
+        "float_step_over_forward": turns["sgm_float"] / turns["forward"],
+        "int8_step_over_float_step": step / turns["sgm_float"],
+        "bp_step_over_qsgm_step": turns["backprop"] / step,
     }
     if TORCH in medians:
         other = medians[TORCH]
@@ -127,20 +130,6 @@ def run_once(
         raise QsgmError(f"{name} failed with exit code {done.returncode}: {lines[-1]}")
     seconds: Seconds = json.loads(done.stdout)["seconds"]
     return seconds | {"process": process}
-
-
-def forward_seconds(prepared: Prepared, repeats: int = 5) -> float:
-    """Seconds of one forward pass of the tuned layers on one batch."""
-    settings = prepared.settings
-    session = prepared.bundle.session(head_file(settings.layers), settings.threads)
-    feeds = {"features": np.ascontiguousarray(prepared.features[:BATCH]), **prepared.start}
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        for _ in range(20):
-            session.run(["outputs"], feeds)
-        times.append((time.perf_counter() - began) / 20)
-    return median(times)
 
 
 def render(report: Mapping[str, Any]) -> RenderableType:
