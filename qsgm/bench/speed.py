@@ -1,8 +1,8 @@
 """Seconds per stage of the whole job, in processes of their own, next to the same job in torch.
 
 Every variant runs several times, in turns, so that whatever else the machine does hits all of
-them; medians are reported. Single steps and forward passes, too short to be compared like that, take
-turns in one process a few hundred times. Ratios are what can be compared between machines.
+them; medians are reported. Single steps and forward passes, too short for that, take turns in one
+process a few hundred times. Ratios are what can be compared between machines.
 """
 
 import importlib.util
