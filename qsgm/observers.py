@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.folded import FloatArray, FoldedSgm
-from qsgm.quantize import SgmRanges
+from qsgm.quantize import LABEL_HIGH, LABEL_LOW, LABELS, SgmRanges
 
 BINS = 4096  # per channel; at least half of them lie within the extremes
 # A grid finer than this times the largest magnitude could not be told from float32's own.
@@ -30,10 +30,6 @@ CLIPPED_ONE_IN = 10_000
 # Clips that the entropy calibrator tries, between one bin a level and the extremes.
 ENTROPY_CLIPS = 128
 NEXT_TO_NOTHING = 1e-4  # of a value, as in onnxruntime's
-
-# The label is known before anything is seen: quality, sine, cosine.
-LABEL_LOW = np.array([0, -1, -1], np.float32)
-LABEL_HIGH = np.array([1, 1, 1], np.float32)
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -280,7 +276,7 @@ class SgmObservers:
 
     def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
         """One batch: inputs (B, P, Ci) and hidden tensors (B, P, H), after ReLU."""
-        self._activation.update(seen[..., : -len(LABEL_LOW)])
+        self._activation.update(seen[..., :-LABELS])
         for observer, values in zip(self._hidden, hidden, strict=True):
             observer.update(values)
 

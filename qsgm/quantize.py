@@ -47,8 +47,10 @@ SMALLEST_SCALE = 1e-30
 CLIP_TOLERANCE_STEPS = 0.5
 # Closer to 0 than half a step, an input is rounded to it.
 UNDERFLOW_STEPS = 0.5
-# The last inputs of every SGM: quality, sine and cosine of the label.
-LABELS = 3
+# The last inputs of every SGM: quality, sine and cosine of the label, whose range is known.
+LABEL_LOW = np.array([0, -1, -1], np.float32)
+LABEL_HIGH = np.array([1, 1, 1], np.float32)
+LABELS = len(LABEL_LOW)
 
 Float64Array = NDArray[np.float64]
 

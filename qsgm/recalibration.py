@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from qsgm.bundle import Bundle
 from qsgm.folded import FloatArray, FoldedSgm, float_trace
-from qsgm.quantize import ActivationBits, SgmRanges, constants, quantize_sgm
+from qsgm.quantize import (
+    LABEL_HIGH,
+    LABEL_LOW,
+    LABELS,
+    ActivationBits,
+    SgmRanges,
+    constants,
+    quantize_sgm,
+)
 
 # Activations grow while layers learn. 16 bits have their headroom for that.
 GROWTH: dict[ActivationBits, float] = {8: 1.5, 16: 1.0}
@@ -23,7 +31,6 @@ _ANGLES = np.arange(8) * np.pi / 4
 ANY_LABEL = np.array(
     [[0, 0, 0], *([1, np.sin(angle), np.cos(angle)] for angle in _ANGLES)], np.float32
 )
-LABEL_LOW, LABEL_HIGH = np.array([0, -1, -1], np.float32), np.ones(3, np.float32)
 # Positions whose windows are in memory at once.
 POSITIONS = 4096
 
@@ -72,6 +79,6 @@ def ranges_of(sgm: FoldedSgm, activation: FloatArray) -> SgmRanges:
 def grown(ranges: SgmRanges, factor: float) -> SgmRanges:
     """Ranges with the high ends of activations and hidden tensors so many times as high."""
     high = ranges.input_high.copy()
-    high[: -len(LABEL_HIGH)] *= factor
+    high[:-LABELS] *= factor
     hidden = tuple(factor * tensor for tensor in ranges.hidden_high)
     return replace(ranges, input_high=high, hidden_high=hidden)

@@ -12,8 +12,7 @@ from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
 from qsgm.folded import FoldedSgm
-from qsgm.observers import LABEL_LOW
-from qsgm.quantize import QuantizedSgm, SgmRanges, constants
+from qsgm.quantize import LABELS, QuantizedSgm, SgmRanges, constants
 from qsgm.report import fidelity_json, plain_table
 from qsgm.train.calibrate import EQUAL_COSINE, Calibration
 
@@ -56,15 +55,13 @@ class LayerReport:
     @property
     def activation_range(self) -> tuple[float, float]:
         """Lowest and highest activation of any channel."""
-        low, high = (
-            ends[: -len(LABEL_LOW)] for ends in (self.ranges.input_low, self.ranges.input_high)
-        )
+        low, high = (ends[:-LABELS] for ends in (self.ranges.input_low, self.ranges.input_high))
         return float(low.min()), float(high.max())
 
     @property
     def activation_scale(self) -> tuple[float, float]:
         """What one u8 step stands for in the finest and in the coarsest activation channel."""
-        step = 1 / self.int8_sgm.input_gain[: -len(LABEL_LOW)]
+        step = 1 / self.int8_sgm.input_gain[:-LABELS]
         return float(step.min()), float(step.max())
 
     def to_json(self) -> dict[str, Any]:
