@@ -18,7 +18,7 @@ from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, 
 from qsgm.defaults import MOST_LAYERS
 from qsgm.errors import QsgmError
 from qsgm.folded import FoldedConv, FoldedSgm
-from qsgm.quantize import ACTIVATION_BITS, ActivationBits
+from qsgm.quantize import ACTIVATION_BITS, LABELS, ActivationBits
 from qsgm.runtime import open_session
 from qsgm.tuning import short_run_factor
 
@@ -290,6 +290,7 @@ def _check_sgms(path: Path, sgms: Mapping[str, Any], most_layers: int) -> None:
                 for conv in convolutions
                 for name, sides in (("weight", 4), ("bias", 1))
             )
+            sane = sane and _is_chain(convolutions)
         except (KeyError, TypeError):
             sane = False
         if not sane:
@@ -297,6 +298,16 @@ def _check_sgms(path: Path, sgms: Mapping[str, Any], most_layers: int) -> None:
                 f"{path}: 'sgms' gives {str(sgms.get(str(layer)))[:80]} for layer {layer}, expected"
                 f" bits and convolutions inside {WEIGHTS}; run `{COMMAND}` again"
             )
+
+
+def _is_chain(convolutions: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether each convolution takes what the one before it gives, and the first the label too."""
+    shapes = [conv["weight"]["shape"] for conv in convolutions]
+    into = [shapes[-1][0] + LABELS, *(out for out, *_ in shapes)]
+    return all(
+        shape[1] == channels and shape[2:] == shapes[0][2:] and conv["bias"]["shape"] == shape[:1]
+        for conv, shape, channels in zip(convolutions, shapes, into, strict=False)
+    )
 
 
 def _size(path: Path) -> float:

@@ -51,14 +51,16 @@ Array = NDArray[np.float32]
 Watch = Callable[[str, int, int], None]
 # Constants of int8 SGMs: by layer, by initializer name.
 Exchanged = Mapping[int, Mapping[str, NDArray[Any]]]
+NOTHING_EXCHANGED: Exchanged = MappingProxyType({})
 
 # Crops that are in memory at once. With more the frozen layers in float take much of it, and are no
 # quicker.
 SLICE = 10
 STEPS_PER_EPOCH = -(-TRAIN_CROPS // BATCH)
 DETECTION_THRESHOLD = 0.5
-# Crops whose activations an int8 SGM is calibrated on anew: where they are vectors, and maps.
-RECALIBRATION_CROPS, RECALIBRATION_MAPS = 400, 16
+# Crops whose activations an int8 SGM is calibrated on anew, and how many at a time; of maps, whose
+# crops have thousands of positions, the first slice has to do.
+RECALIBRATION_CROPS, RECALIBRATION_SLICE = 400, 16
 # What each layer leaves per crop: convolution and ReLU, and the pool's one position.
 OUTPUTS_PER_CROP = {
     1: 8 * 2 * 62**2,
@@ -357,23 +359,24 @@ def train(
     probe: bool = True,
     recipe: Recipe | None = None,
     keep: Collection[int] = (),
-    exchanged: Exchanged = MappingProxyType({}),
+    exchanged: Exchanged = NOTHING_EXCHANGED,
 ) -> FinetuneResult:
     """One run of one method on a prepared demonstration; what was prepared stays as it is.
 
     Args:
         prepared: as :func:`prepare` returned it.
         settings: may differ from those it was prepared with in `method`, `precision`, `blocks`,
-            `optimizer`, `epochs`, `threads` and `probe_every`.
+            `optimizer`, `epochs`, `recalibrate`, `threads` and `probe_every`.
         watch: told about every epoch.
         probe: whether to measure the gradients' fidelity.
         recipe: optimizer and rates; None: the bundle's for these settings.
         keep: steps after which the weights are kept (0: before the first).
-        exchanged: constants of int8 SGMs in the place of the bundle's; see
-            :mod:`qsgm.recalibration`, which gives them where the settings say `recalibrate`.
+        exchanged: constants of int8 SGMs in the place of the bundle's; where the settings say
+            `recalibrate` they are found here instead.
 
     Raises:
-        QsgmError: training diverged, or the bundle lacks the method.
+        QsgmError: training diverged, the bundle lacks the method, or there is nothing to
+            recalibrate.
     """
     began = time.perf_counter()
     bundle, layers = prepared.bundle, settings.layers
@@ -384,14 +387,16 @@ def train(
     blocks = run_blocks(settings)
     bundle.check_blocks(blocks)
     recipe = recipe or bundle.recipe(settings.method, layers, settings.optimizer, blocks)
+    extra = {}
     if settings.recalibrate:
-        exchanged = recalibrated(bundle, activations_before(prepared, settings))
+        exchanged = recalibrate(prepared, settings)
+        extra["recalibration"] = time.perf_counter() - began
     prober = _Prober(prepared, settings, probe, exchanged)
     loop = _GuardedLoop(prepared, settings, recipe, keep, prober, exchanged)
     losses, tuning = _run_epochs(loop, prober, settings, watch or _ignore)
     weights = loop.weights()
     accuracy = validate(prepared, weights, settings)
-    seconds = prepared.seconds | {"tuning": tuning, "probes": prober.seconds}
+    seconds = prepared.seconds | extra | {"tuning": tuning, "probes": prober.seconds}
     seconds["total"] = prepared.seconds["total"] + time.perf_counter() - began
     result = FinetuneResult(
         prepared,
@@ -404,8 +409,10 @@ def train(
         seconds,
         kept=loop.kept,
     )
-    int8 = (settings.method, settings.precision) == ("sgm", "int8")
-    return replace(result, warnings=drift_warnings(result.fidelity) if int8 else ())
+    if settings.precision == "float":
+        return result
+    advice = "compare with --float" if settings.recalibrate else "tune it with --recalibrate"
+    return replace(result, warnings=drift_warnings(result.fidelity, advice))
 
 
 def _run_epochs(
@@ -432,21 +439,62 @@ def validate(prepared: Prepared, weights: Mapping[str, Array], settings: Setting
     return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
 
 
+def recalibrate(prepared: Prepared, settings: Settings) -> Exchanged:
+    """Constants of this run's int8 SGMs for this object; see :mod:`qsgm.recalibration`.
+
+    Raises:
+        QsgmError: the run has no int8 SGM, or the bundle no probe to see activations with.
+    """
+    if not (settings.precision == "int8" and run_blocks(settings).sgm_layers):
+        raise QsgmError(
+            "there is nothing to recalibrate: the run has no int8 SGM; leave --recalibrate out, or "
+            "tune two layers or more with --method sgm and --int8"
+        )
+    return recalibrated(prepared.bundle, activations_before(prepared, settings))
+
+
 def activations_before(prepared: Prepared, settings: Settings) -> dict[int, Array]:
-    """What the layers in front of SGMs give on some training crops before any step, (N, P, C)."""
-    count = RECALIBRATION_CROPS if settings.layers <= defaults.LAYERS else RECALIBRATION_MAPS
-    return activations_of(prepared, settings, prepared.start, np.arange(count))
+    """What the layers in front of SGMs give on some training crops before any step, (N, P, C).
+
+    Of maps a few crops do, each has thousands of positions; in memory are a few crops at a time.
+    """
+    session = open_probe(prepared, settings)
+    found: dict[int, list[Array]] = {}
+    for first in range(0, RECALIBRATION_CROPS, RECALIBRATION_SLICE):
+        rows = np.arange(first, first + RECALIBRATION_SLICE)
+        some = activations_of(session, prepared, settings, prepared.start, rows)
+        for layer, activation in some.items():
+            if first == 0 or activation.shape[1] == 1:
+                found.setdefault(layer, []).append(activation)
+    return {layer: np.concatenate(slices) for layer, slices in found.items()}
+
+
+def open_probe(
+    prepared: Prepared, settings: Settings, exchanged: Exchanged = NOTHING_EXCHANGED
+) -> ort.InferenceSession:
+    """A session of the probe graph. Raises QsgmError where the bundle has none."""
+    bundle, name = prepared.bundle, probe_file(settings.layers)
+    if name not in bundle.manifest["files"]:
+        raise QsgmError(
+            f"the bundle {bundle.folder} has no {name}, by which SGMs are looked at; export it "
+            f"again with `{COMMAND}`"
+        )
+    constants = constants_of(exchanged, tuned_layers(settings.layers))
+    return bundle.session(name, settings.threads, constants)
 
 
 def activations_of(
-    prepared: Prepared, settings: Settings, weights: Mapping[str, Array], rows: NDArray[np.int64]
+    session: ort.InferenceSession,  # of the probe graph
+    prepared: Prepared,
+    settings: Settings,
+    weights: Mapping[str, Array],
+    rows: NDArray[np.int64],
 ) -> dict[int, Array]:
     """What the layers in front of SGMs give on the crops `rows` with these weights, (B, P, C)."""
-    layers, bundle = sgm_blocks(settings).sgm_layers, prepared.bundle
+    layers = sgm_blocks(settings).sgm_layers
     feeds = {"features": prepared.features, "labels": prepared.labels, "rows": rows, **weights}
-    session = bundle.session(probe_file(settings.layers), settings.threads)
     names = [f"activation{layer}" for layer in layers]
-    with running_graphs(bundle):
+    with running_graphs(prepared.bundle):
         values = session.run(names, feeds, only_what_is_asked())
     return dict(zip(layers, values, strict=True))
 
@@ -552,8 +600,7 @@ class _Prober:
         self._bundle = prepared.bundle
         name = probe_file(settings.layers)
         if wanted and self._layers and name in prepared.bundle.manifest["files"]:
-            constants = constants_of(exchanged, tuned_layers(settings.layers))
-            self._session = prepared.bundle.session(name, settings.threads, constants)
+            self._session = open_probe(prepared, settings, exchanged)
             self._refuse_unless_complete(name, self._session)
         self._data = {"features": prepared.features, "labels": prepared.labels}
         self.seconds = time.perf_counter() - began

@@ -63,8 +63,8 @@ class Codes:
     headroom: int  # what calibration saw is widened by this
     high_step: int  # one step of the first plane in codes
     # Taken off every code before it is rounded. With half a step of the high plane taken off,
-    # rounding gives that plane, the remainder is -128 to 127, and the low plane's zero point adds
-    # the half again.
+    # rounding gives that plane, the remainder is -128 to 128, and the low plane's zero point adds
+    # the half again. (At 128 it clips: one code in 65536, at ties only.)
     shift: int
 
 

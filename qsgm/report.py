@@ -85,6 +85,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "seconds": seconds_json(result.seconds),
         "peak_activation_bytes": result.peak_activation_bytes,
         "blocks": str(result.blocks),
+        "recalibrated": settings.recalibrate,
         "trunk": result.trunk,
         "optimizer": result.recipe.optimizer,
         "rates": list(result.recipe.rates_over(result.steps)),

@@ -205,6 +205,13 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("initializers", "weight4", "offset"), 10**9, "'initializers' gives"),
         (("initializers", "weight4", "offset"), -1, "'initializers' gives"),
         (("initializers", "weight1"), None, "'initializers' gives None for weight1"),
+        (("sgms", "5"), None, "'sgms' gives None for layer 5"),
+        (("sgms", "5", "bits"), 7, "'sgms' gives"),
+        (("sgms", "5", "convolutions"), [], "'sgms' gives"),
+        (("sgms", "4", "convolutions", 0, "weight", "offset"), 10**9, "'sgms' gives"),
+        (("sgms", "4", "convolutions", 0, "weight", "shape"), [1, 1, 19, 12], "'sgms' gives"),
+        (("sgms", "4", "convolutions", 0, "bias", "shape"), [3], "'sgms' gives"),
+        (("sgms", "4", "convolutions", 1, "weight", "shape"), [12, 16, 1, 1], "'sgms' gives"),
     ],
 )
 def test_a_manifest_that_says_nonsense_is_refused_by_its_key(

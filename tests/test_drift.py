@@ -16,7 +16,7 @@ GOOD = LayerFidelity(
 def test_nothing_is_said_of_gradients_that_are_faithful_whatever_clips() -> None:
     clipping = replace(GOOD, clipped_fraction=0.3, underflow_fraction=0.9)
     edge = replace(GOOD, cos_int8_float=LEAST_COSINE)
-    assert drift_warnings({4: clipping, 5: edge}) == ()
+    assert drift_warnings({4: clipping, 5: edge}, "mend it") == ()
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_nothing_is_said_of_gradients_that_are_faithful_whatever_clips() -> None
 def test_an_unfaithful_sgm_is_named_with_what_its_ranges_do(
     change: dict[str, float], reason: str
 ) -> None:
-    (line,) = drift_warnings({4: GOOD, 5: replace(GOOD, cos_int8_float=0.7, **change)})
+    (line,) = drift_warnings({4: GOOD, 5: replace(GOOD, cos_int8_float=0.7, **change)}, "mend it")
     start = "layer 5: int8 gradients are at a cosine of 0.70 to the float ones"
     assert line.startswith(start + reason)
-    assert line.endswith("tune it with --recalibrate")
+    assert line.endswith("; mend it")

@@ -1,5 +1,6 @@
 """Other ranges for int8 SGMs, exchanged in a session: the graph is left as it was exported."""
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -8,6 +9,8 @@ import numpy as np
 import onnx
 import pytest
 
+from qsgm import QsgmError, cli
+from qsgm.blocks import parse_blocks
 from qsgm.bundle import Bundle, probe_file
 from qsgm.fidelity import cosine
 from qsgm.finetuning import Settings, activations_before, constants_of, prepare, train
@@ -128,6 +131,56 @@ def test_recalibration_mends_ranges_that_are_far_too_narrow(bundle: Bundle) -> N
         assert clipping.fidelity[layer].cos_int8_float < 0.99
         assert mended.fidelity[layer].clipped_fraction == 0
         assert mended.fidelity[layer].cos_int8_float > 0.999
+
+
+@pytest.mark.parametrize("blocks", ["3,4,5,6", "1-4,5,6"])
+def test_vectors_behind_maps_are_calibrated_on_as_many_crops_as_without_maps(
+    blocks: str, bundle: Bundle
+) -> None:
+    settings = Settings(layers=len(parse_blocks(blocks).layers), blocks=blocks)
+    prepared = prepare(draw_frame()[0], bundle, settings)
+    for layer, activation in activations_before(prepared, settings).items():
+        crops, positions = activation.shape[:2]
+        assert (crops, positions) == ((16, 169) if layer == 3 else (400, 1))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--method", "bp"],
+        ["--method", "bp", "--blocks", "4-6"],
+        ["--float"],
+        ["--layers", "1"],
+    ],
+)
+def test_a_run_without_int8_sgms_has_nothing_to_recalibrate(
+    options: list[str],
+    frame_path: Path,
+    bundle_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    start = ["finetune", "--recalibrate", "--epochs", "1", "--bundle", str(bundle_folder)]
+    assert cli.run([*start, *options, str(frame_path)]) == 1
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: there is nothing to recalibrate")
+
+
+def test_a_recalibrated_run_says_so_and_how_long_it_took(
+    frame_path: Path, bundle_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = ["finetune", "--recalibrate", "--epochs", "1", "--bundle", str(bundle_folder)]
+    assert cli.run([*start, "--blocks", "4,5-6", "--json", str(frame_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["recalibrated"] is True
+    assert report["seconds"]["recalibration"] > 0
+
+
+def test_a_bundle_without_a_probe_cannot_recalibrate(bundle: Bundle) -> None:
+    files = {k: v for k, v in bundle.manifest["files"].items() if k != probe_file(3)}
+    without = replace(bundle, manifest=bundle.manifest | {"files": files})
+    settings = Settings(epochs=1, recalibrate=True)
+    with pytest.raises(QsgmError, match=r"has no probe_3.onnx, by which SGMs are looked at"):
+        train(prepare(draw_frame()[0], without, settings), settings)
 
 
 def test_a_bundles_probe_takes_recalibrated_constants_for_all_its_sgms(bundle: Bundle) -> None:

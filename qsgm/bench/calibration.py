@@ -31,6 +31,7 @@ from qsgm.finetuning import (
     Watch,
     activations_before,
     activations_of,
+    open_probe,
     prepare,
     sgm_blocks,
     train,
@@ -341,18 +342,23 @@ def observe_run(prepared: Prepared, settings: Settings, layers: Sequence[int]) -
     rng = np.random.default_rng([settings.seed, 3])
     sgms = {layer: prepared.bundle.float_sgm(layer) for layer in layers}
     observers = {layer: SgmObservers(sgm) for layer, sgm in sgms.items()}
+    session = open_probe(prepared, settings)
     for weights in run.kept.values():
         rows = rng.choice(TRAIN_CROPS, OBSERVED_CROPS, replace=False)
-        for layer, seen in seen_by_sgms(prepared, settings, weights, rows).items():
+        for layer, seen in seen_by_sgms(session, prepared, settings, weights, rows).items():
             observers[layer].update(seen, float_trace(sgms[layer], seen)[1])
     return observers
 
 
 def seen_by_sgms(
-    prepared: Prepared, settings: Settings, weights: Mapping[str, FloatArray], rows: Rows
+    session: Any,  # of the probe graph
+    prepared: Prepared,
+    settings: Settings,
+    weights: Mapping[str, FloatArray],
+    rows: Rows,
 ) -> dict[int, FloatArray]:
     """By layer, activation and label (B, P, Ci) of the crops `rows` with these weights."""
-    activations = activations_of(prepared, settings, weights, rows)
+    activations = activations_of(session, prepared, settings, weights, rows)
     labels = prepared.labels[rows][:, None]  # (B, 1, 3)
     return {
         layer: np.concatenate([x, np.repeat(labels, x.shape[1], axis=1)], axis=2)

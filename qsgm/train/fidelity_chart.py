@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from qsgm.drift import NOTABLE_CLIPPING
+from qsgm.drift import LEAST_COSINE
 from qsgm.files import write_bytes_atomic
 from qsgm.finetuning import STEPS_PER_EPOCH, FinetuneResult
 from qsgm.train.charts import DPI, GREY, SMALL, TEXT
@@ -118,7 +118,6 @@ ROWS = (
                 "{:.2f}",
                 from_zero,
                 100,
-                100 * NOTABLE_CLIPPING,
             ),
         ),
     ),
@@ -285,6 +284,6 @@ def caption(result: FinetuneResult) -> str:
     return (
         f"{BATCH} random crops at steps 0 to {last} by {every}; {STEPS_PER_EPOCH} steps are an "
         f"epoch. Numbers: means over the run.{mist}\n"
-        f"Dashed: int8 as large as true; {100 * NOTABLE_CLIPPING:g} % clipped, above which an "
-        f"object counts as unlike the calibration set."
+        f"Dashed: int8 as large as true. Below a mean cosine of {LEAST_COSINE:g} to float an "
+        "object counts as unlike the calibration set."
     )
