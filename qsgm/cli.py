@@ -28,6 +28,7 @@ from qsgm import __version__, defaults, paths
 from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
+    from qsgm.bench.calibration import Variant
     from qsgm.blocks import Blocks
     from qsgm.bundle import Bundle, Precision
     from qsgm.finetuning import FinetuneResult, Settings
@@ -612,7 +613,9 @@ def bench_fidelity(
 
 @bench.command("calibration")
 def bench_calibration(
-    frames: FramesOption = None,
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR", help="To judge on: none calibrated on.")
+    ],
     calib: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
     ] = None,
@@ -634,15 +637,15 @@ def bench_calibration(
     as_json: JsonOption = False,
 ) -> None:
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
-    from qsgm.bench.calibration import VARIANTS, measure_calibration, parse_variant
+    from qsgm.bench.calibration import VARIANTS, measure_calibration
     from qsgm.bench.frames import list_frames
     from qsgm.finetuning import Settings
 
     chart = None if picture is None else _host_module("qsgm.train.calibration_chart")
     folder = paths.calibration_folder(calib)
-    some = list_frames(folder if frames is None else frames, limit)
+    some = list_frames(frames, limit)
     settings = Settings(epochs=epochs, seed=seed, threads=threads)
-    chosen = [parse_variant(text) for text in variants] if variants else VARIANTS
+    chosen = [_variant(text) for text in variants] if variants else VARIANTS
     with _progress() as watch:
         report = measure_calibration(some, folder, _bundle(bundle), settings, watch, chosen)
     _write_report(report.to_json(), output)
@@ -820,6 +823,15 @@ def _blocks(text: str) -> "Blocks":
         return parse_blocks(text)
     except QsgmError as error:
         raise typer.BadParameter(str(error), param_hint="'--blocks'") from error
+
+
+def _variant(text: str) -> "Variant":
+    from qsgm.bench.calibration import parse_variant
+
+    try:
+        return parse_variant(text)
+    except QsgmError as error:
+        raise typer.BadParameter(str(error), param_hint="'--variant'") from error
 
 
 def _channels(text: str) -> tuple[int, ...]:
