@@ -19,10 +19,10 @@ from qsgm import bundle as bundles
 from qsgm.blocks import one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.crops import cut_crops, plan_crops
-from qsgm.folded import FoldedSgm
+from qsgm.folded import FoldedSgm, float_trace
 from qsgm.images import write_png
 from qsgm.quantize import QuantizedSgm, SgmRanges, quantize_sgm
-from qsgm.train.calibrate import Demonstration, float_trace
+from qsgm.train.calibration_set import Demonstration
 from qsgm.train.export import build_trunks, bundle_files
 from qsgm.train.fold import FoldedNet, fold_net, fold_sgm
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,13 @@ import pytest
 from rich.console import Console
 
 from qsgm import QsgmError, cli
+from qsgm.bench import calibration
 from qsgm.bench.calibration import (
     ANGLE,
     CLIPPED,
     COS_FLOAT,
     DETECTION,
+    LEGEND,
     METRICS,
     OWN_CROPS,
     OWN_RUN,
@@ -32,8 +35,10 @@ from qsgm.bench.calibration import (
 )
 from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bundle import Bundle, load_bundle
-from qsgm.finetuning import Settings, prepare, train
+from qsgm.crops import TRAIN_CROPS
+from qsgm.finetuning import Prepared, Settings, activations_of, open_probe, prepare, train
 from qsgm.folded import float_trace
+from qsgm.quantize import integer_forward, quantize_sgm
 from qsgm.train.calibration_chart import write_calibration_chart
 from tests.conftest import draw_frame
 
@@ -69,33 +74,70 @@ def test_ranges_of_the_very_object_leave_16_bits_nothing_to_clip(report: Calibra
     assert (own[..., COS_FLOAT] > 0.999).all()
 
 
-def test_a_run_is_observed_from_its_first_step_to_its_last(bundle: Bundle) -> None:
-    prepared = prepare(draw_frame()[0], bundle, SHORT)
-    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))(4, TWO[0])
-    steps = 25
-    run = train(prepared, Settings(epochs=1, precision="float"), probe=False, keep=(0, steps))
-    assert len(run.kept) == 2
-    seen = prepared.features[:800]
-    assert ranges.input_high.shape == (19,)
-    assert len(seen) == 800
-    # Every hidden channel's span is what the float SGM makes of inputs inside the inputs' span.
-    sgm = bundle.float_sgm(4)
-    middle = ((ranges.input_low + ranges.input_high) / 2)[None, None].astype(np.float32)
-    for high, tensor in zip(ranges.hidden_high, float_trace(sgm, middle)[1], strict=True):
-        assert high.shape == tensor.shape[2:]
+@pytest.fixture(scope="module")
+def prepared(bundle: Bundle) -> Prepared:
+    return prepare(draw_frame()[0], bundle, SHORT)
 
 
-def test_an_exchanged_variant_gives_what_a_bundle_calibrated_so_would_give(bundle: Bundle) -> None:
-    prepared = prepare(draw_frame()[0], bundle, SHORT)
+def with_labels(activation: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """What an SGM sees (B, 1, C + 3) of activations (B, 1, C) and labels (B, 3)."""
+    return np.concatenate([activation, labels[:, None]], axis=2)
+
+
+def test_a_run_is_observed_from_its_first_step_to_its_last(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration, "OBSERVED_CROPS", TRAIN_CROPS)
+    ranges_of_run = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
+    # By hand: all crops before the first of the epoch's 25 steps, and after the last.
+    floating = replace(SHORT, precision="float")
+    kept = train(prepared, floating, probe=False, keep=(0, 25)).kept
+    probe, rows = open_probe(prepared, SHORT), np.arange(TRAIN_CROPS)
+    before, after = (activations_of(probe, prepared, SHORT, kept[step], rows) for step in (0, 25))
+    for layer in (4, 5):
+        ranges = ranges_of_run(layer, TWO[0])
+        ends = np.array([before[layer].max(axis=(0, 1)), after[layer].max(axis=(0, 1))])
+        assert (ends[0] > ends[1]).any()  # each of the two moments has its say
+        assert (ends[1] > ends[0]).any()
+        np.testing.assert_allclose(ranges.input_high[:-3], ends.max(axis=0), rtol=1e-5)
+        both = np.concatenate([before[layer], after[layer]])
+        low = both.min(axis=(0, 1))
+        np.testing.assert_allclose(ranges.input_low[:-3], low, rtol=1e-5, atol=1e-6)
+        seen = with_labels(both, np.tile(prepared.labels[rows], (2, 1)))
+        hidden = float_trace(prepared.bundle.float_sgm(layer), seen)[1]
+        for high, tensor in zip(ranges.hidden_high, hidden, strict=True):
+            np.testing.assert_allclose(high, tensor.max(axis=(0, 1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "variant", [Variant(8, 4, "mse"), Variant(8, 16, "minmax"), TWO[0]], ids=str
+)
+def test_an_exchanged_variant_gives_what_a_bundle_calibrated_so_would_give(
+    prepared: Prepared, variant: Variant
+) -> None:
     ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
-    variants = Variant(8, 4, "mse"), TWO[0]
+    exchanged = exchange(prepared, SHORT, ranges, variant)
+    probe, rows = open_probe(prepared, SHORT, exchanged), np.arange(32)
+    feeds = {"features": prepared.features, "labels": prepared.labels, **prepared.start}
+    for layer in (4, 5):
+        names = [f"activation{layer}", f"int8{layer}"]
+        activation, int8 = probe.run(names, {**feeds, "rows": rows})
+        bits = variant.activation_bits, variant.weight_bits
+        q = quantize_sgm(prepared.bundle.float_sgm(layer), ranges(layer, variant), *bits)
+        seen = with_labels(activation, prepared.labels[rows])
+        np.testing.assert_array_equal(int8, integer_forward(q, seen)[0])
+
+
+def test_a_run_is_driven_and_judged_with_the_exchanged_variant(prepared: Prepared) -> None:
+    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
     coarse, fine = (
         train(prepared, SHORT, exchanged=exchange(prepared, SHORT, ranges, variant))
-        for variant in variants
+        for variant in (Variant(8, 4, "mse"), TWO[0])
     )
     for layer in (4, 5):
         assert fine.fidelity[layer].cos_int8_float > 0.9999
         assert 0.5 < coarse.fidelity[layer].cos_int8_float < 0.999
+    assert coarse.losses != fine.losses
 
 
 def test_a_loss_is_a_missed_crop_in_a_hundred_or_an_angle_beyond_what_runs_differ_by(
@@ -156,15 +198,21 @@ def test_a_bundle_of_8_bit_activations_is_refused(bundle_folder: Path, bundle: B
     assert bundle.activation_bits(5) == 16
 
 
-def test_the_tables_fit_into_80_columns_and_the_json_holds_every_run(
-    report: CalibrationReport,
-) -> None:
-    console = Console(width=80, file=io.StringIO(), force_terminal=False)
-    console.print(report.render())
-    assert isinstance(console.file, io.StringIO)
-    shown = console.file.getvalue()
-    assert "…" not in shown
-    assert all(str(variant) in shown for variant in TWO)
+def test_the_tables_fit_into_80_columns(report: CalibrationReport) -> None:
+    texts = []
+    for width in (80, 200):
+        console = Console(width=width, record=True, file=io.StringIO())
+        console.print(report.render())
+        texts.append([line.rstrip() for line in console.export_text().splitlines()])
+    narrow, wide = texts
+    rules = [line for line in narrow if "──" in line]
+    assert len(rules) == len(TWO)
+    assert rules == [line for line in wide if "──" in line]
+    assert all(str(variant) in "\n".join(narrow) for variant in TWO)
+    assert max(map(len, LEGEND.splitlines())) <= 80
+
+
+def test_the_json_holds_every_run(report: CalibrationReport) -> None:
     values = json.loads(json.dumps(report.to_json(), allow_nan=False))
     row = values["sources"][OWN_RUN][str(TWO[0])]
     assert len(row["per_frame"]) == 2

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from qsgm import cli, finetune
-from qsgm.bench.fidelity import FidelityReport, measure_fidelity
+from qsgm.bench.fidelity import LEGEND, FidelityReport, measure_fidelity
 from qsgm.bench.frames import list_frames
 from qsgm.bundle import Bundle
 from qsgm.finetuning import Settings
@@ -45,10 +45,17 @@ def test_the_worst_frame_and_probe_are_named(report: FidelityReport) -> None:
 
 
 def test_the_tables_fit_into_80_columns(report: FidelityReport) -> None:
-    file = io.StringIO()
-    Console(width=80, file=file).print(report.render())
-    assert "…" not in file.getvalue()
-    assert "fired on 0 of 2 frames" in file.getvalue()
+    texts = []
+    for width in (80, 200):
+        console = Console(width=width, record=True, file=io.StringIO())
+        console.print(report.render())
+        texts.append([line.rstrip() for line in console.export_text().splitlines()])
+    narrow, wide = texts
+    rules = [line for line in narrow if "──" in line]
+    assert len(rules) == 2
+    assert rules == [line for line in wide if "──" in line]
+    assert max(map(len, LEGEND.splitlines())) <= 80
+    assert "the drift watch fired on 0 of 2 frames" in narrow
 
 
 def test_bench_fidelity_runs_from_the_command_line(

@@ -17,28 +17,28 @@ from qsgm import QsgmError
 from qsgm.blocks import single_layers
 from qsgm.cli import CalibratorName
 from qsgm.files import check_replaceable
-from qsgm.folded import FloatArray
+from qsgm.folded import FloatArray, float_trace
 from qsgm.images import read_frame, write_png
 from qsgm.observers import CALIBRATORS, Observer, Span
 from qsgm.quantize import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
-from qsgm.train import calibrate as module
-from qsgm.train import export_report
+from qsgm.train import calibration_runs, export_report
 from qsgm.train.calibrate import (
     AUTO,
     Calibration,
-    CalibrationSet,
-    RunPlan,
-    Trainee,
     best_calibrator,
     calibrate,
-    float_trace,
     held_out_frames,
-    measure,
     observe_frame,
+)
+from qsgm.train.calibration_runs import (
+    RunPlan,
+    Trainee,
     prepare,
     run,
     run_plans,
+    torch_product,
 )
+from qsgm.train.calibration_set import CalibrationSet
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
 from qsgm.train.draw_demo import draw_demo
@@ -46,6 +46,7 @@ from qsgm.train.fold import fold_sgm, run_folded_sgm
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.objects import TABLE_KINDS
 from qsgm.train.sgm import Sgm
+from qsgm.train.sgm_fidelity import measure
 
 RATES = {str(single_layers(tuned)): (1e-3,) * tuned for tuned in (1, 2, 3)}
 EPOCHS = 1
@@ -53,8 +54,8 @@ EPOCHS = 1
 
 @pytest.fixture(autouse=True)
 def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CROPS", 70)
-    monkeypatch.setattr(module, "MAP_CROPS", 40)
+    monkeypatch.setattr(calibration_runs, "CROPS", 70)
+    monkeypatch.setattr(calibration_runs, "MAP_CROPS", 40)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +83,7 @@ def test_the_float_trace_is_the_folded_sgm(layer: int, side: int) -> None:
     activation, labels = torch.randn(9, 16, side, side), torch.randn(9, 3)
     filled = labels[:, None].expand(-1, side**2, -1)
     seen = torch.cat([activation.flatten(2).transpose(1, 2), filled], dim=2)
-    gradient, hidden = float_trace(sgm, seen.numpy())
+    gradient, hidden = float_trace(sgm, seen.numpy(), torch_product)
     expected = run_folded_sgm(sgm, activation, labels).flatten(2).transpose(1, 2)
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-6)
     assert [tensor.shape for tensor in hidden] == [(9, side**2, 8), (9, side**2, 6)]
@@ -95,7 +96,7 @@ def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trai
 
     def gradient(layer: int, inputs: FloatArray) -> FloatArray:
         seen[layer].append(inputs)
-        return float_trace(trainee.sgms[layer], inputs)[0]
+        return trainee.float_trace(layer, inputs)[0]
 
     for i in range(2):
         for tuned in (2, 3):
@@ -113,14 +114,14 @@ def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trai
         np.testing.assert_array_equal(ranges[layer].input_high[:16], inputs[:, :16].max(axis=0))
         np.testing.assert_array_equal(ranges[layer].input_low[16:], [0, -1, -1])
         np.testing.assert_array_equal(ranges[layer].input_high[16:], [1, 1, 1])
-        _, hidden = float_trace(trainee.sgms[layer], inputs[:, None])
+        _, hidden = trainee.float_trace(layer, inputs[:, None])
         for high, tensor in zip(ranges[layer].hidden_high, hidden, strict=True):
             np.testing.assert_allclose(high, tensor.max(axis=(0, 1)), rtol=1e-5)
 
 
 def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
     def gradient(layer: int, seen: FloatArray) -> FloatArray:
-        return float_trace(trainee.sgms[layer], seen)[0]
+        return trainee.float_trace(layer, seen)[0]
 
     plan = RunPlan(3, 70, EPOCHS)
     first, *_, last = run(trainee, CalibrationSet(folder)[0], plan, [0], gradient)
@@ -189,10 +190,10 @@ def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
     def gradient(layer: int, values: FloatArray) -> FloatArray:
         if layer == 4:
             inputs.append(values)
-        return float_trace(trainee.sgms[layer], values)[0]
+        return trainee.float_trace(layer, values)[0]
 
     list(run(trainee, frames[3], RunPlan(3, 70, EPOCHS), [0, 3], gradient))
-    floating = float_trace(trainee.sgms[4], inputs[0])[0].ravel().astype(np.float64)
+    floating = trainee.float_trace(4, inputs[0])[0].ravel().astype(np.float64)
     for name, cosine in result.cosines[4].items():
         int8 = quantize_sgm(trainee.sgms[4], seen[4].ranges(name, 256), 8)
         got = integer_forward(int8, inputs[0])[0].ravel().astype(np.float64)
@@ -229,7 +230,7 @@ def test_auto_takes_the_calibrator_that_does_best(
     def tenfold(seen: Observer, _levels: int) -> Span:
         return 10 * seen.low, 10 * seen.high
 
-    monkeypatch.setitem(module.CALIBRATORS, "minmax", tenfold)
+    monkeypatch.setitem(CALIBRATORS, "minmax", tenfold)
     result = calibrate(trainee, CalibrationSet(folder), 0, ignore, EPOCHS, activation_bits=8)
     for layer, name in result.chosen.items():
         assert name != "minmax"
@@ -278,7 +279,7 @@ def test_the_command_line_offers_every_calibrator() -> None:
 def test_memory_of_calibration_does_not_grow_with_its_frames(
     tmp_path: Path, trainee: Trainee, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "CROPS", 33)
+    monkeypatch.setattr(calibration_runs, "CROPS", 33)
     draw_calibration_set(tmp_path / "calib", count=6, seed=3)
     frames = CalibrationSet(tmp_path / "calib")
     entries, peaks = frames._entries, []
@@ -328,7 +329,7 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
 
     def gradient(layer: int, inputs: FloatArray) -> FloatArray:
         seen[layer].append(inputs)
-        return float_trace(of_five.sgms[layer], inputs)[0]
+        return of_five.float_trace(layer, inputs)[0]
 
     for i in range(2):
         list(run(of_five, frames[i], run_plans(5, EPOCHS)[-1], [0, i], gradient))

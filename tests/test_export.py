@@ -15,7 +15,8 @@ from rich.console import Console
 from qsgm import QsgmError
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, Recipe, load_bundle
-from qsgm.train import calibrate, export
+from qsgm.train import calibration_runs, export
+from qsgm.train.calibration_set import CalibrationSet
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
 from qsgm.train.export import fold_and_quantize
@@ -81,7 +82,7 @@ def small_and_on_one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibrate, "CROPS", 70)
+        patch.setattr(calibration_runs, "CROPS", 70)
         yield
     torch.set_num_threads(before)
 
@@ -258,8 +259,8 @@ def test_a_folder_with_something_else_is_refused_before_any_work(
 
 
 def test_folding_that_changes_outputs_is_refused(workplace: Workplace) -> None:
-    trainee = calibrate.prepare(workplace.checkpoint)
-    frame = calibrate.CalibrationSet(workplace.folder / "calib")[0]
+    trainee = calibration_runs.prepare(workplace.checkpoint)
+    frame = CalibrationSet(workplace.folder / "calib")[0]
     assert export.check_folding(trainee, frame) < 1e-4
     trainee.sgms[5].convs[1].bias[0] += 0.1
     with pytest.raises(QsgmError, match="folding batchnorm changes the SGM behind layer 5"):

@@ -34,8 +34,8 @@ from qsgm.fidelity import (
 )
 from qsgm.finetuning import STEPS_PER_EPOCH, FinetuneResult, Settings, finetune, prepare, train
 from qsgm.report import fidelity_command_json, fidelity_command_report
-from qsgm.train.calibrate import update_from
 from qsgm.train.local import LayerState, columns, layer_forward
+from qsgm.train.sgm_fidelity import update_from
 
 RNG = np.random.default_rng(0)
 GRADIENT = RNG.normal(size=(32, 16)).astype(np.float32)

@@ -3,6 +3,7 @@
 import numpy as np
 import onnx
 import pytest
+from onnx import helper
 
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
@@ -11,7 +12,22 @@ from qsgm.runtime import open_session, running
 from qsgm.train.graphs.inspection import integer_operators
 
 
-def test_products_of_u8_and_s8_are_exact_on_cpus_without_vnni(bundle: Bundle) -> None:
+def test_products_of_u8_and_s8_are_exact_where_pairs_exceed_16_bits() -> None:
+    """On CPUs without VNNI only with the setting below; those with it need none."""
+    weight = np.tile(np.array([127, -128, 127, 127], np.int8), (4, 2)).T  # (8, 4)
+    node = helper.make_node("MatMulInteger", ["x", "weight"], ["y"])
+    x_info = helper.make_tensor_value_info("x", onnx.TensorProto.UINT8, ["rows", 8])
+    y_info = helper.make_tensor_value_info("y", onnx.TensorProto.INT32, ["rows", 4])
+    constant = onnx.numpy_helper.from_array(weight, "weight")
+    graph = helper.make_graph([node], "product", [x_info], [y_info], [constant])
+    opsets = [helper.make_opsetid("", 17)]
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=9)
+    x = np.full((3, 8), 255, np.uint8)
+    (product,) = open_session(model.SerializeToString()).run(None, {"x": x})
+    np.testing.assert_array_equal(product, x.astype(int) @ weight.astype(int))
+
+
+def test_sessions_ask_for_exact_products_on_cpus_without_vnni(bundle: Bundle) -> None:
     options = bundle.session(trunk_file("float", 3)).get_session_options()
     assert options.get_session_config_entry("session.x64quantprecision") == "1"
 

@@ -19,7 +19,7 @@ from qsgm.blocks import one_block, single_layers
 from qsgm.folded import FloatArray
 from qsgm.runtime import session_options
 from qsgm.train import trunk_ranges
-from qsgm.train.calibrate import CalibrationSet, Demonstration
+from qsgm.train.calibration_set import CalibrationSet, Demonstration
 from qsgm.train.draw_calibration import draw_calibration_set
 from qsgm.train.fold import FoldedLayer, FoldedNet, fold_net, fold_sgm
 from qsgm.train.graphs.build import Graph

@@ -19,8 +19,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from qsgm.bench.resources import right_table
 from qsgm.bench.speed import TORCH, VARIANTS, run_once
+from qsgm.bench.tables import right_table
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import MANIFEST, Bundle, Precision, probe_file
 from qsgm.finetuning import Settings, Watch, peak_activation_bytes, trunk_precision

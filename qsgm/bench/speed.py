@@ -19,7 +19,7 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 
-from qsgm.bench.resources import step_seconds
+from qsgm.bench.step_jobs import step_seconds
 from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError

@@ -36,17 +36,9 @@ from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.folded import FoldedSgm
 from qsgm.quantize import ActivationBits, QuantizedSgm, quantize_sgm
-from qsgm.train.calibrate import (
-    AUTO,
-    EPOCHS,
-    CalibrationSet,
-    Demonstration,
-    Trainee,
-    Watch,
-    calibrate,
-    measure,
-    prepare,
-)
+from qsgm.train.calibrate import AUTO, calibrate
+from qsgm.train.calibration_runs import EPOCHS, Trainee, prepare
+from qsgm.train.calibration_set import CalibrationSet, Demonstration, Watch
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.curvature import FLAT
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
@@ -64,6 +56,7 @@ from qsgm.train.graphs.trunk import (
 )
 from qsgm.train.graspnet import normalize
 from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
+from qsgm.train.sgm_fidelity import measure
 from qsgm.train.trunk_ranges import observe_trunk
 
 SEED = 0

@@ -24,7 +24,7 @@ import onnxruntime as ort
 from onnx import helper
 
 from qsgm.bench.memory import StepMemory
-from qsgm.bench.resources import start_of, still_loop
+from qsgm.bench.step_jobs import start_of, still_loop
 from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle, Precision, step_file
 from qsgm.finetuning import running_graphs

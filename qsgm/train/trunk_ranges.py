@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch.nn import functional as F
 
 from qsgm.crops import cut_crops, plan_crops
-from qsgm.train.calibrate import CalibrationSet, Demonstration, Watch
+from qsgm.train.calibration_set import CalibrationSet, Demonstration, Watch
 from qsgm.train.fold import FoldedNet
 from qsgm.train.graspnet import normalize
 from qsgm.train.quantize_trunk import LayerRange

@@ -1,0 +1,114 @@
+"""The calibration set: demonstration frames in a folder, and the manifest that vouches for them."""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+from qsgm.images import read_demonstration
+
+MANIFEST = "manifest.json"
+FORMAT, VERSION = "qsgm-calibration", 1
+
+# Of whatever goes through a set: (what is going on, frames done, of how many)
+Watch = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """A frame (H, W, 3) BGR and the object's centre (x, y) in it [px]."""
+
+    image: NDArray[np.uint8]
+    center_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """What the manifest says of one frame: a name in the same folder, its digest, its object."""
+
+    file: str
+    sha256: str
+    center_px: tuple[float, float]
+
+
+class CalibrationSet:
+    """The frames that a folder's manifest lists; each is read when its turn comes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / MANIFEST
+        try:
+            self.manifest_bytes = path.read_bytes()
+            self._entries = _entries(json.loads(self.manifest_bytes))
+        except OSError as error:
+            raise QsgmError(
+                f"{folder} is no calibration set, it has no {MANIFEST};"
+                f" make one with `qsgm draw-calibration -o {folder}`"
+            ) from error
+        except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
+            raise QsgmError(
+                f'{path} is damaged: expected {{"frames": [{{"file", "sha256", "center_px"}}]}};'
+                " make it again with `qsgm draw-calibration`"
+            ) from error
+        if not self._entries:
+            raise QsgmError(f"{path} lists no frames: there is nothing to calibrate on")
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __getitem__(self, i: int) -> Demonstration:
+        entry = self._entries[i]
+        path = self.folder / entry.file
+        image = read_demonstration(path)
+        if hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
+            raise QsgmError(
+                f"{path} is not the frame the manifest describes (its sha256"
+                " differs); restore it or make the set again with `qsgm draw-calibration`"
+            )
+        (x, y), (height, width) = entry.center_px, image.shape[:2]
+        if x >= width or y >= height:
+            raise QsgmError(
+                f"{self.folder / MANIFEST} has the object of {entry.file} at ({x:g}, {y:g}) px,"
+                f" outside its frame of {width}x{height}; correct its center_px"
+            )
+        return Demonstration(image, entry.center_px)
+
+
+def _entries(manifest: Any) -> list[_Entry]:
+    """Every frame's entry; the manifest may name its format and version.
+
+    Raises ValueError, KeyError, TypeError, ArithmeticError or RecursionError for a damaged one.
+    """
+    if not isinstance(manifest, dict):
+        raise TypeError("not a JSON object")
+    named = manifest.get("format", FORMAT), manifest.get("version", VERSION)
+    if named != (FORMAT, VERSION):
+        raise ValueError(f"another format: {named!r}")
+    return [
+        _entry(**{name: f[name] for name in _Entry.__annotations__}) for f in manifest["frames"]
+    ]
+
+
+def _entry(file: Any, sha256: Any, center_px: Any) -> _Entry:
+    if not isinstance(file, str) or not _is_plain(file):
+        raise ValueError(f"not a plain file name: {file!r}")
+    if not isinstance(sha256, str):
+        raise TypeError(f"no digest: {sha256!r}")
+    x, y = center_px
+    for value in (x, y):
+        if type(value) not in (int, float) or not isfinite(value) or value < 0:
+            raise ValueError(f"no place in a frame: {center_px!r}")
+    return _Entry(file, sha256, (x, y))
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a name stays in its folder, and in its line of a message."""
+    return name.isprintable() and not re.search(r"[/\\]", name) and name not in ("", ".", "..")
