@@ -30,6 +30,9 @@ CLIPPED_ONE_IN = 10_000
 # Clips that the entropy calibrator tries, between one bin a level and the extremes.
 ENTROPY_CLIPS = 128
 NEXT_TO_NOTHING = 1e-4  # of a value, as in onnxruntime's
+# A run that reaches so many times what a typical one reaches has blown up. Other runs would have to
+# pay for it with nearly all of their codes.
+BLOWN_UP = 8.0
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -273,6 +276,8 @@ class SgmObservers:
     def __init__(self, sgm: FoldedSgm) -> None:
         self._activation = Observer(len(sgm.convs[-1].bias))
         self._hidden = [Observer(len(conv.bias)) for conv in sgm.convs[:-1]]
+        # The largest value of each tensor, by run.
+        self._tops: list[list[float]] = []
 
     def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
         """One batch: inputs (B, P, Ci) and hidden tensors (B, P, H), after ReLU."""
@@ -281,17 +286,28 @@ class SgmObservers:
             observer.update(values)
 
     def merge(self, other: "SgmObservers") -> None:
-        """Take in what was seen on another frame."""
+        """Take in what was seen in another run."""
         self._activation.merge(other._activation)
         for observer, others in zip(self._hidden, other._hidden, strict=True):
             observer.merge(others)
+        self._tops += other.tops()
+
+    def tops(self) -> list[list[float]]:
+        """The largest value of each tensor, by merged run; of what was seen, if none was merged."""
+        tensors = [self._activation, *self._hidden]
+        return self._tops or [[float(tensor.high.max()) for tensor in tensors]]
 
     def ranges(self, calibrator: str, levels: int) -> SgmRanges:
-        """What a calibrator makes of it, for so many codes."""
+        """What a calibrator makes of it, for so many codes.
+
+        No range is wider than :data:`BLOWN_UP` times a typical run's.
+        """
         span = CALIBRATORS[calibrator]
         low, high = span(self._activation, levels)
+        limit, *limits = BLOWN_UP * np.median(self.tops(), axis=0).astype(np.float32)
+        hidden = (span(observer, levels)[1] for observer in self._hidden)
         return SgmRanges(
-            np.concatenate([low, LABEL_LOW]),
-            np.concatenate([high, LABEL_HIGH]),
-            tuple(span(observer, levels)[1] for observer in self._hidden),
+            np.concatenate([np.minimum(low, limit), LABEL_LOW]),
+            np.concatenate([np.minimum(high, limit), LABEL_HIGH]),
+            tuple(np.minimum(high, top) for high, top in zip(hidden, limits, strict=True)),
         )

@@ -287,3 +287,28 @@ def test_every_tensor_of_an_sgm_has_its_calibrators_range(name: str, levels: int
     np.testing.assert_array_equal(ranges.input_high, [*high, 1, 1, 1])
     for got, tensor in zip(ranges.hidden_high, hidden, strict=True):
         np.testing.assert_array_equal(got, CALIBRATORS[name](observed(tensor), levels)[1])
+
+
+def test_a_run_that_blew_up_widens_ranges_to_eight_times_a_typical_runs_at_most() -> None:
+    rng = np.random.default_rng(0)
+    widths = [(4, 4 + 3, 1, 1), (4, 4, 1, 1)]
+    convs = tuple(FoldedConv(np.zeros(w, np.float32), np.zeros(4, np.float32)) for w in widths)
+    sgm = FoldedSgm(4, convs)
+    total = SgmObservers(sgm)
+    highest = np.zeros(4, np.float32)
+    for scale in (1.0, 1.2, 500.0, 0.9, 1.1):
+        one = SgmObservers(sgm)
+        seen = rng.uniform(0, scale, (50, 1, 7)).astype(np.float32)
+        hidden = rng.uniform(0, 2 * scale, (50, 1, 4)).astype(np.float32)
+        one.update(seen, [hidden])
+        # On its own a run is the typical one.
+        alone = one.ranges("minmax", 256)
+        np.testing.assert_array_equal(alone.input_high[:4], seen[..., :4].max(axis=(0, 1)))
+        if scale < 2:
+            highest = np.maximum(highest, alone.input_high[:4])
+        total.merge(one)
+    ranges = total.ranges("minmax", 256)
+    assert (ranges.input_high[:4] >= highest).all()
+    assert (ranges.input_high[:4] < 8 * 1.2).all()
+    assert (ranges.hidden_high[0] < 8 * 2.4).all()
+    assert (ranges.hidden_high[0] > 8 * 1.5).all()
