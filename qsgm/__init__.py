@@ -15,14 +15,15 @@ from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
     from qsgm.bundle import load_bundle
-    from qsgm.finetuning import Settings, finetune
+    from qsgm.finetuning import finetune
     from qsgm.images import read_frame
+    from qsgm.settings import Settings
     from qsgm.tuned import load_object
 else:
     # Imported when asked for, since they bring in ONNX Runtime and OpenCV. None of these modules
     # may have the name of an export: importing it would put the module in the export's place.
     _HOME = {
-        "Settings": "qsgm.finetuning",
+        "Settings": "qsgm.settings",
         "finetune": "qsgm.finetuning",
         "load_bundle": "qsgm.bundle",
         "load_object": "qsgm.tuned",

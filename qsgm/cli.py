@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from qsgm.bench.calibration import Variant
     from qsgm.blocks import Blocks
     from qsgm.bundle import Bundle, Precision
-    from qsgm.finetuning import FinetuneResult, Settings
+    from qsgm.finetuning import FinetuneResult
+    from qsgm.settings import Settings
 
 EXIT_BAD_INPUT = 1
 EXIT_INTERRUPTED = 130
@@ -420,7 +421,7 @@ def bench_accuracy(
     from qsgm.bench.accuracy import measure_accuracy
     from qsgm.bench.accuracy_report import accuracy_report_json, render
     from qsgm.bench.frames import list_frames
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     charts = None if pictures is None else _host_module("qsgm.train.charts")
     lengths = _run_lengths(short)
@@ -519,7 +520,7 @@ def bench_speed(
     """Seconds per stage on the first frame, next to the same job in torch if it is installed."""
     from qsgm.bench.frames import list_frames
     from qsgm.bench.speed import measure_speed, render
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     frame = list_frames(paths.calibration_folder() if frames is None else frames, 1)[0].path
     settings = Settings(
@@ -569,7 +570,7 @@ def bench_memory(
     """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
     from qsgm.bench.frames import list_frames
     from qsgm.bench.memory import measure_memory
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     lengths = _layer_counts(processes)
     host = _host_module("qsgm.train.liveness")
@@ -601,7 +602,7 @@ def bench_fidelity(
     """int8 gradients against float and true ones along a run on every frame, worst cases named."""
     from qsgm.bench.fidelity import measure_fidelity
     from qsgm.bench.frames import list_frames
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     some = list_frames(paths.calibration_folder() if frames is None else frames, limit)
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
@@ -639,7 +640,7 @@ def bench_calibration(
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
     from qsgm.bench.calibration import VARIANTS, measure_calibration
     from qsgm.bench.frames import list_frames
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     chart = None if picture is None else _host_module("qsgm.train.calibration_chart")
     folder = paths.calibration_folder(calib)
@@ -782,7 +783,7 @@ def _settings(
     blocks: str | None = None,
     trunk: TrunkChoice | None = None,
 ) -> "Settings":
-    from qsgm.finetuning import Settings
+    from qsgm.settings import Settings
 
     if method is MethodName.BP and int8:
         _complain("note: backpropagation runs in float; --int8 concerns SGMs only")

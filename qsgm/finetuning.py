@@ -4,63 +4,42 @@
     result = finetune(frame, load_bundle(Path("export")))
     result.save(Path("mug"), name="mug")
 
-The stages stand alone: :func:`prepare` does what all methods share, :func:`train` one run of one
-method on it, so that methods can be compared on the very same crops.
+The stages stand alone: :func:`qsgm.preparing.prepare` does what all methods share, :func:`train`
+one run of one method on it.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
-from qsgm import defaults
-from qsgm.angles import angle_error, decode_angle, mean_direction
-from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
-from qsgm.bundle import (
-    COMMAND,
-    Bundle,
-    Method,
-    OptimizerName,
-    Precision,
-    Recipe,
-    head_file,
-    probe_file,
-    step_file,
-    trunk_file,
-)
-from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
+from qsgm.blocks import Blocks
+from qsgm.bundle import Bundle, Precision, Recipe, step_file
+from qsgm.crops import TRAIN_CROPS
 from qsgm.drift import drift_warnings
 from qsgm.errors import QsgmError
-from qsgm.fidelity import PROBED, LayerFidelity, compare_probe, mean_over_run
-from qsgm.recalibration import recalibrated
+from qsgm.fidelity import LayerFidelity, mean_over_run
+from qsgm.preparing import (
+    STEPS_PER_EPOCH,
+    Accuracy,
+    Array,
+    Prepared,
+    Watch,
+    ignore,
+    prepare,
+    running_graphs,
+    validate,
+)
+from qsgm.probing import NOTHING_EXCHANGED, Exchanged, Probe, Prober, constants_of, recalibrate
 from qsgm.report import run_json
-from qsgm.runtime import running
+from qsgm.settings import Settings, run_blocks, sgm_blocks, trunk_precision
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
-from qsgm.tuning import BATCH, Features, StepLoop, tune
-from qsgm.weights import to_conv_layout, to_step_layout
+from qsgm.tuning import BATCH, StepLoop, tune
+from qsgm.weights import to_conv_layout
 
-Array = NDArray[np.float32]
-# (stage, how much of it is done, out of how much)
-Watch = Callable[[str, int, int], None]
-# Constants of int8 SGMs: by layer, by initializer name.
-Exchanged = Mapping[int, Mapping[str, NDArray[Any]]]
-NOTHING_EXCHANGED: Exchanged = MappingProxyType({})
-
-# Crops that are in memory at once. With more the frozen layers in float take much of it, and are no
-# quicker.
-SLICE = 10
-STEPS_PER_EPOCH = -(-TRAIN_CROPS // BATCH)
-DETECTION_THRESHOLD = 0.5
-# Crops whose activations an int8 SGM is calibrated on anew, and how many at a time; of maps, whose
-# crops have thousands of positions, the first slice has to do.
-RECALIBRATION_CROPS, RECALIBRATION_SLICE = 400, 16
 # What each layer leaves per crop: convolution and ReLU, and the pool's one position.
 OUTPUTS_PER_CROP = {
     1: 8 * 2 * 62**2,
@@ -70,61 +49,6 @@ OUTPUTS_PER_CROP = {
     5: 16 * 2,
     6: 3,
 }
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How to tune; what is None is up to the bundle."""
-
-    method: Method = "sgm"
-    precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
-    layers: int = defaults.LAYERS  # how many of the last ones
-    blocks: str | None = None  # those layers in groups, such as 4,5-6; None: each on its own
-    trunk: Precision | None = None  # of the frozen layers
-    optimizer: OptimizerName | None = None
-    epochs: int = defaults.EPOCHS
-    recalibrate: bool = False  # the int8 SGMs, on this object's crops before the first step
-    seed: int = 0
-    center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
-    threads: int = 1
-    probe_every: int = defaults.PROBE_EVERY  # steps from one look at the gradients to the next
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """On the validation crops."""
-
-    detection_accuracy: float  # share of crops on the right side of 0.5
-    angle_mae_deg: float  # modulo 180 degrees, over positives
-
-
-@dataclass(frozen=True)
-class Probe:
-    """What the gradients were worth after so many steps (0: before the first one)."""
-
-    step: int
-    layers: dict[int, LayerFidelity]  # by SGM layer
-
-    @property
-    def epoch(self) -> float:
-        """Passes over the crops that the steps make."""
-        return self.step / STEPS_PER_EPOCH
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """One demonstration as the tuned layers see it."""
-
-    bundle: Bundle
-    settings: Settings
-    features: Features  # (N, P, C), input of the first tuned layer
-    labels: Array  # (N, 3)
-    angle_rad: NDArray[np.float64]  # (N,) of the labels, the offset included
-    offset_rad: float  # the demonstration's orientation as the untouched network sees it
-    offset_strength: float  # 1: all crops agree on it, 0: there is none (a round object)
-    start: dict[str, Array]  # weights and biases, in the step graphs' layout
-    zero_shot: Accuracy
-    seconds: dict[str, float]  # crops, features
 
 
 @dataclass(frozen=True)
@@ -201,42 +125,6 @@ class FinetuneResult:
         return ObjectDescription(name, self.prepared.bundle.encoding, self.prepared.offset_rad)
 
 
-def sgm_blocks(settings: Settings) -> Blocks:
-    """The blocks of a run with SGMs: what its steps are, or what backpropagation is compared with.
-
-    Raises:
-        QsgmError: the settings' blocks are none, or those of another number of layers.
-    """
-    if settings.blocks is None:
-        return single_layers(settings.layers)
-    blocks = parse_blocks(settings.blocks)
-    if len(blocks.layers) != settings.layers:
-        raise QsgmError(
-            f"the blocks {blocks} are the last {len(blocks.layers)} layers, the settings say "
-            f"{settings.layers}: give both the same"
-        )
-    return blocks
-
-
-def run_blocks(settings: Settings) -> Blocks:
-    """The blocks that are really trained.
-
-    Raises:
-        QsgmError: as :func:`sgm_blocks`, or the blocks do not go with the method.
-    """
-    blocks, whole = sgm_blocks(settings), one_block(settings.layers)
-    if settings.method == "sgm":
-        if blocks == whole and settings.layers > 1:
-            raise QsgmError(f"the blocks {blocks} leave no place for an SGM: pass --method bp")
-        return blocks
-    if settings.blocks is not None and blocks != whole:
-        raise QsgmError(
-            f"backpropagation trains all layers as one block, {whole}, not as {blocks}: leave "
-            "--blocks out, or --method bp"
-        )
-    return whole
-
-
 def finetune(
     frame: NDArray[np.uint8],
     bundle: Bundle,
@@ -253,104 +141,6 @@ def finetune(
     return train(prepare(frame, bundle, settings, watch), settings, watch)
 
 
-def prepare(
-    frame: NDArray[np.uint8], bundle: Bundle, settings: Settings, watch: Watch | None = None
-) -> Prepared:
-    """Crops, features, labels and what the untouched network makes of them.
-
-    Of the settings only `layers`, `trunk`, `seed`, `center_px` and `threads` matter here; the
-    others are checked.
-    """
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-        raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
-    bundle.check_blocks(run_blocks(settings))
-    began = time.perf_counter()
-    height, width = frame.shape[:2]
-    center = settings.center_px or (width / 2, height / 2)
-    plan = plan_crops((height, width), center, np.random.default_rng(settings.seed))
-    seconds = {"crops": 0.0, "features": 0.0}
-    features = see(frame, plan, bundle, settings, seconds, watch or _ignore)
-    start = _in_step_layout(bundle.start_weights(settings.layers))
-    outputs = answers(features, start, bundle, settings)
-    seen = decode_angle(outputs[:, 1], outputs[:, 2], bundle.encoding)
-    # Validation crops have no say in it.
-    positive = np.flatnonzero(plan.quality[:TRAIN_CROPS] > 0)
-    offset, strength = mean_direction(seen[positive] - plan.turn_rad[positive])
-    labels = label_crops(plan, offset, bundle.encoding)
-    angle = plan.turn_rad.astype(np.float64) + offset
-    seconds["total"] = time.perf_counter() - began
-    return Prepared(
-        bundle,
-        settings,
-        features,
-        labels,
-        angle,
-        offset,
-        strength,
-        start,
-        accuracy_of(outputs[TRAIN_CROPS:], labels[TRAIN_CROPS:], angle[TRAIN_CROPS:], bundle),
-        seconds,
-    )
-
-
-def see(
-    frame: NDArray[np.uint8],
-    plan: CropPlan,
-    bundle: Bundle,
-    settings: Settings,
-    seconds: dict[str, float],
-    watch: Watch,
-) -> Features:
-    """Features (N, P, C) of the planned crops, cut slice by slice: they never all exist."""
-    name = trunk_file(trunk_precision(settings, bundle), settings.layers)
-    session = bundle.session(name, settings.threads)
-    features: Features | None = None
-    for first in range(0, len(plan), SLICE):
-        rows = slice(first, min(first + SLICE, len(plan)))
-        with _adding_to(seconds, "crops"):
-            crops = cut_crops(frame, plan[rows])
-        with _adding_to(seconds, "features"):
-            with running_graphs(bundle):
-                some = session.run(["features"], {"crops": crops})[0]
-            if features is None:
-                features = np.empty((len(plan), *some.shape[1:]), some.dtype)
-            features[rows] = some
-        watch("crops", rows.stop, len(plan))
-    assert features is not None, "a plan has at least one crop"
-    return features
-
-
-def trunk_precision(settings: Settings, bundle: Bundle) -> Precision:
-    """Of the frozen layers: the settings' or, where they have none, the bundle's."""
-    return settings.trunk or bundle.trunk
-
-
-def answers(
-    features: Features, weights: Mapping[str, Array], bundle: Bundle, settings: Settings
-) -> Array:
-    """Quality, sine and cosine (N, 3) that the tuned layers give with these weights."""
-    session = bundle.session(head_file(settings.layers), settings.threads)
-    slices = range(0, len(features), SLICE)
-    with running_graphs(bundle):
-        return np.concatenate(
-            [
-                session.run(["outputs"], {"features": features[i : i + SLICE], **weights})[0]
-                for i in slices
-            ]
-        )
-
-
-def accuracy_of(
-    outputs: Array, labels: Array, angle_rad: NDArray[np.float64], bundle: Bundle
-) -> Accuracy:
-    """Outputs (N, 3) against labels (N, 3) and the angles (N,) that the labels encode."""
-    positive = labels[:, 0] > 0
-    detected = outputs[:, 0] > DETECTION_THRESHOLD
-    angle = decode_angle(outputs[positive, 1], outputs[positive, 2], bundle.encoding)
-    error = np.degrees(angle_error(angle, angle_rad[positive]))
-    return Accuracy(float(np.mean(detected == positive)), float(np.mean(error)))
-
-
 def train(
     prepared: Prepared,
     settings: Settings,
@@ -364,7 +154,7 @@ def train(
     """One run of one method on a prepared demonstration; what was prepared stays as it is.
 
     Args:
-        prepared: as :func:`prepare` returned it.
+        prepared: as :func:`qsgm.preparing.prepare` returned it.
         settings: may differ from those it was prepared with in `method`, `precision`, `blocks`,
             `optimizer`, `epochs`, `recalibrate`, `threads` and `probe_every`.
         watch: told about every epoch.
@@ -391,9 +181,9 @@ def train(
     if settings.recalibrate:
         exchanged = recalibrate(prepared, settings)
         extra["recalibration"] = time.perf_counter() - began
-    prober = _Prober(prepared, settings, probe, exchanged)
+    prober = Prober(prepared, settings, probe, exchanged)
     loop = _GuardedLoop(prepared, settings, recipe, keep, prober, exchanged)
-    losses, tuning = _run_epochs(loop, prober, settings, watch or _ignore)
+    losses, tuning = _run_epochs(loop, prober, settings, watch or ignore)
     weights = loop.weights()
     accuracy = validate(prepared, weights, settings)
     seconds = prepared.seconds | extra | {"tuning": tuning, "probes": prober.seconds}
@@ -416,7 +206,7 @@ def train(
 
 
 def _run_epochs(
-    loop: "_GuardedLoop", prober: "_Prober", settings: Settings, watch: Watch
+    loop: "_GuardedLoop", prober: "Prober", settings: Settings, watch: Watch
 ) -> tuple[list[float], float]:
     """Mean loss of every epoch, and the seconds that training took without the probes."""
     losses: list[float] = []
@@ -430,90 +220,6 @@ def _run_epochs(
     # Methods with the same seed see the same batches in the same order.
     tune(loop, TRAIN_CROPS, settings.epochs, np.random.default_rng([settings.seed, 1]), after_epoch)
     return losses, time.perf_counter() - began - (prober.seconds - probing)
-
-
-def validate(prepared: Prepared, weights: Mapping[str, Array], settings: Settings) -> Accuracy:
-    """Weights, in the step graphs' layout, on the crops that took no part in training."""
-    rows = slice(TRAIN_CROPS, None)
-    outputs = answers(prepared.features[rows], weights, prepared.bundle, settings)
-    return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
-
-
-def recalibrate(prepared: Prepared, settings: Settings) -> Exchanged:
-    """Constants of this run's int8 SGMs for this object; see :mod:`qsgm.recalibration`.
-
-    Raises:
-        QsgmError: the run has no int8 SGM, or the bundle no probe to see activations with.
-    """
-    if not (settings.precision == "int8" and run_blocks(settings).sgm_layers):
-        raise QsgmError(
-            "there is nothing to recalibrate: the run has no int8 SGM; leave --recalibrate out, or "
-            "tune two layers or more with --method sgm and --int8"
-        )
-    return recalibrated(prepared.bundle, activations_before(prepared, settings))
-
-
-def activations_before(prepared: Prepared, settings: Settings) -> dict[int, Array]:
-    """What the layers in front of SGMs give on some training crops before any step, (N, P, C).
-
-    Of maps a few crops do, each has thousands of positions; in memory are a few crops at a time.
-    """
-    session = open_probe(prepared, settings)
-    found: dict[int, list[Array]] = {}
-    for first in range(0, RECALIBRATION_CROPS, RECALIBRATION_SLICE):
-        rows = np.arange(first, first + RECALIBRATION_SLICE)
-        some = activations_of(session, prepared, settings, prepared.start, rows)
-        for layer, activation in some.items():
-            if first == 0 or activation.shape[1] == 1:
-                found.setdefault(layer, []).append(activation)
-    return {layer: np.concatenate(slices) for layer, slices in found.items()}
-
-
-def open_probe(
-    prepared: Prepared, settings: Settings, exchanged: Exchanged = NOTHING_EXCHANGED
-) -> ort.InferenceSession:
-    """A session of the probe graph. Raises QsgmError where the bundle has none."""
-    bundle, name = prepared.bundle, probe_file(settings.layers)
-    if name not in bundle.manifest["files"]:
-        raise QsgmError(
-            f"the bundle {bundle.folder} has no {name}, by which SGMs are looked at; export it "
-            f"again with `{COMMAND}`"
-        )
-    constants = constants_of(exchanged, tuned_layers(settings.layers))
-    return bundle.session(name, settings.threads, constants)
-
-
-def activations_of(
-    session: ort.InferenceSession,  # of the probe graph
-    prepared: Prepared,
-    settings: Settings,
-    weights: Mapping[str, Array],
-    rows: NDArray[np.int64],
-) -> dict[int, Array]:
-    """What the layers in front of SGMs give on the crops `rows` with these weights, (B, P, C)."""
-    layers = sgm_blocks(settings).sgm_layers
-    feeds = {"features": prepared.features, "labels": prepared.labels, "rows": rows, **weights}
-    names = [f"activation{layer}" for layer in layers]
-    with running_graphs(prepared.bundle):
-        values = session.run(names, feeds, only_what_is_asked())
-    return dict(zip(layers, values, strict=True))
-
-
-def constants_of(exchanged: Exchanged, layers: Collection[int]) -> dict[str, NDArray[Any]]:
-    """Those of the SGMs behind `layers`, by initializer name."""
-    return {name: array for layer in layers for name, array in exchanged.get(layer, {}).items()}
-
-
-def only_what_is_asked() -> ort.RunOptions:
-    """Nothing is computed that the outputs asked for do not need."""
-    options = ort.RunOptions()
-    options.only_execute_path_to_fetches = True
-    return options
-
-
-def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:
-    """Around every run of a bundle's graph: they are checked when loaded, not for what they do."""
-    return running(f"the bundle {bundle.folder}", f"export it again with `{COMMAND}`")
 
 
 def peak_activation_bytes(blocks: Blocks, batch: int = BATCH) -> dict[str, int]:
@@ -538,7 +244,7 @@ class _GuardedLoop(StepLoop):
         settings: Settings,
         recipe: Recipe,
         keep: Collection[int],
-        prober: "_Prober",
+        prober: "Prober",
         exchanged: Exchanged,
     ) -> None:
         bundle, blocks = prepared.bundle, run_blocks(settings)
@@ -582,72 +288,8 @@ class _GuardedLoop(StepLoop):
             self._prober(self.steps, self.finite_weights())
 
 
-class _Prober:
-    """Compares gradients on one random training batch at a time and keeps what it finds."""
-
-    def __init__(
-        self, prepared: Prepared, settings: Settings, wanted: bool, exchanged: Exchanged
-    ) -> None:
-        if settings.probe_every < 1:
-            raise ValueError(f"`probe_every` must be 1 step or more, got {settings.probe_every}")
-        began = time.perf_counter()
-        self.probes: list[Probe] = []
-        self._layers = sgm_blocks(settings).sgm_layers
-        self._names = [f"{kind}{k}" for k in self._layers for kind in PROBED]
-        self._every = settings.probe_every
-        self._rng = np.random.default_rng([settings.seed, 2])
-        self._session = None
-        self._bundle = prepared.bundle
-        name = probe_file(settings.layers)
-        if wanted and self._layers and name in prepared.bundle.manifest["files"]:
-            self._session = open_probe(prepared, settings, exchanged)
-            self._refuse_unless_complete(name, self._session)
-        self._data = {"features": prepared.features, "labels": prepared.labels}
-        self.seconds = time.perf_counter() - began
-
-    def wants(self, step: int) -> bool:
-        return self._session is not None and step % self._every == 0
-
-    def __call__(self, step: int, weights: Mapping[str, Array]) -> None:
-        assert self._session is not None, "nobody wants to probe"
-        began = time.perf_counter()
-        rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
-        feeds = {**self._data, "rows": rows, **weights}
-        with running_graphs(self._bundle):
-            values = self._session.run(self._names, feeds, only_what_is_asked())
-        outputs = dict(zip(self._names, values, strict=True))
-        self.probes.append(Probe(step, compare_probe(outputs, self._layers)))
-        self.seconds += time.perf_counter() - began
-
-    def _refuse_unless_complete(self, name: str, session: ort.InferenceSession) -> None:
-        there = {output.name for output in session.get_outputs()}
-        missing = [wanted for wanted in self._names if wanted not in there]
-        if missing:
-            raise QsgmError(
-                f"{name} of the bundle {self._bundle.folder} has no output {missing[0]}: another "
-                f"version of qsgm wrote it; export it again with `{COMMAND}`"
-            )
-
-
-def _in_step_layout(weights: Mapping[str, Array]) -> dict[str, Array]:
-    return {
-        name: to_step_layout(value) if value.ndim > 1 else value for name, value in weights.items()
-    }
-
-
 def _in_conv_layout(weights: Mapping[str, Array], like: Mapping[str, Array]) -> dict[str, Array]:
     return {
         name: to_conv_layout(weights[name], value.shape[-1]) if value.ndim > 1 else weights[name]
         for name, value in like.items()
     }
-
-
-@contextmanager
-def _adding_to(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    began = time.perf_counter()
-    yield
-    seconds[stage] += time.perf_counter() - began
-
-
-def _ignore(_stage: str, _done: int, _of: int) -> None:
-    """Watch nothing."""

@@ -20,7 +20,8 @@ from qsgm.fidelity import LayerFidelity
 from qsgm.predict import Detection
 
 if TYPE_CHECKING:
-    from qsgm.finetuning import Accuracy, FinetuneResult
+    from qsgm.finetuning import FinetuneResult
+    from qsgm.preparing import Accuracy
 
 FIDELITY_LEGEND = (
     "means over the run; cos: cosine of int8, float and true gradients; norm ratio: |int8|/|true|; "

@@ -24,9 +24,11 @@ from qsgm.bench.speed import measure_speed, ratios
 from qsgm.bench.staging import BORDER_PX, CutOut, Scene, cut_out, make_scenes, put_down
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, Recipe, load_bundle, step_file
-from qsgm.finetuning import Settings, finetune, prepare, train
+from qsgm.finetuning import finetune, train
 from qsgm.images import write_png
 from qsgm.predict import Detection
+from qsgm.preparing import prepare
+from qsgm.settings import Settings
 from qsgm.tuning import StepLoop, batches
 
 SHORT = Settings(epochs=1)

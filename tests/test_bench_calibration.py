@@ -36,9 +36,12 @@ from qsgm.bench.calibration import (
 from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.crops import TRAIN_CROPS
-from qsgm.finetuning import Prepared, Settings, activations_of, open_probe, prepare, train
+from qsgm.finetuning import train
 from qsgm.folded import float_trace
+from qsgm.preparing import Prepared, prepare
+from qsgm.probing import activations_of, open_probe
 from qsgm.quantize import integer_forward, quantize_sgm
+from qsgm.settings import Settings
 from qsgm.train.calibration_chart import write_calibration_chart
 from tests.conftest import draw_frame
 

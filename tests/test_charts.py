@@ -14,7 +14,7 @@ from qsgm import cli
 from qsgm.bench.accuracy import AccuracyReport, Runs, curve_steps, groups_of
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle, Recipe
-from qsgm.finetuning import Settings
+from qsgm.settings import Settings
 from qsgm.train.charts import LINE_HEIGHT, learning_curves, write_learning_curves
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ import pytest
 from qsgm import __version__, cli, finetuning
 from qsgm.bundle import NETWORK, trunk_file
 from qsgm.errors import QsgmError
-from qsgm.finetuning import Settings
+from qsgm.settings import Settings
 
 FINETUNE_KEYS = {
     "object",

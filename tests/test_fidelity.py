@@ -32,8 +32,10 @@ from qsgm.fidelity import (
     sqnr_db,
     weighted_error,
 )
-from qsgm.finetuning import STEPS_PER_EPOCH, FinetuneResult, Settings, finetune, prepare, train
+from qsgm.finetuning import FinetuneResult, finetune, train
+from qsgm.preparing import STEPS_PER_EPOCH, prepare
 from qsgm.report import fidelity_command_json, fidelity_command_report
+from qsgm.settings import Settings
 from qsgm.train.local import LayerState, columns, layer_forward
 from qsgm.train.sgm_fidelity import update_from
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from qsgm import cli
 from qsgm.bundle import MANIFEST, Bundle, probe_file
-from qsgm.finetuning import FinetuneResult, Probe, Settings, finetune
+from qsgm.finetuning import FinetuneResult, finetune
+from qsgm.probing import Probe
+from qsgm.settings import Settings
 from qsgm.train.fidelity_chart import (
     DOTS,
     LABEL_GAP,

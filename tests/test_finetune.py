@@ -10,22 +10,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object
+from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object, preparing, probing
 from qsgm.angles import encode_angle
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, head_file
 from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
-from qsgm.finetuning import (
-    Accuracy,
-    FinetuneResult,
-    Settings,
-    accuracy_of,
-    peak_activation_bytes,
-    prepare,
-    train,
-)
+from qsgm.finetuning import FinetuneResult, peak_activation_bytes, train
+from qsgm.preparing import Accuracy, accuracy_of, prepare
 from qsgm.quantize import SgmRanges, constants, quantize_sgm
 from qsgm.report import finetune_json, to_json
+from qsgm.settings import Settings
 from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]
@@ -139,8 +133,9 @@ def test_every_method_tunes_every_number_of_layers(
 @pytest.fixture
 def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers 1 to 3 see large maps."""
-    monkeypatch.setattr(finetuning, "TRAIN_CROPS", 64)
-    monkeypatch.setattr(finetuning, "plan_crops", partial(plan_crops, count=96))
+    for module in (preparing, probing, finetuning):
+        monkeypatch.setattr(module, "TRAIN_CROPS", 64)
+    monkeypatch.setattr(preparing, "plan_crops", partial(plan_crops, count=96))
 
 
 @pytest.mark.usefixtures("few_crops")
@@ -202,7 +197,7 @@ def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
 def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
     frame: Frame, bundle: Bundle, settings: Settings, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(finetuning, "plan_crops", pytest.fail)
+    monkeypatch.setattr(preparing, "plan_crops", pytest.fail)
     with pytest.raises(QsgmError, match=said) as raised:
         finetune(frame, bundle, settings)
     assert "\n" not in str(raised.value)

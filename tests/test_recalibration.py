@@ -13,8 +13,10 @@ from qsgm import QsgmError, cli
 from qsgm.blocks import parse_blocks
 from qsgm.bundle import Bundle, probe_file
 from qsgm.fidelity import cosine
-from qsgm.finetuning import Settings, activations_before, constants_of, prepare, train
+from qsgm.finetuning import train
 from qsgm.folded import FloatArray, FoldedConv, FoldedSgm, float_trace
+from qsgm.preparing import prepare
+from qsgm.probing import activations_before, constants_of
 from qsgm.quantize import (
     QuantizedSgm,
     SgmRanges,
@@ -25,6 +27,7 @@ from qsgm.quantize import (
 )
 from qsgm.recalibration import ANY_LABEL, grown, ranges_of, recalibrated
 from qsgm.runtime import open_session
+from qsgm.settings import Settings
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.sgm import int8_sgm
 from qsgm.train.graphs.sharing import SharedConstants

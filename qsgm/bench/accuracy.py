@@ -14,7 +14,9 @@ from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle, Method, OptimizerName, Precision, Recipe
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import Prepared, Settings, Watch, prepare, train, validate
+from qsgm.finetuning import train
+from qsgm.preparing import Prepared, Watch, prepare, validate
+from qsgm.settings import Settings
 from qsgm.tuning import BATCH
 
 Floats = NDArray[np.float64]

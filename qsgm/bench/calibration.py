@@ -23,21 +23,11 @@ from qsgm.blocks import tuned_layers
 from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import (
-    Exchanged,
-    FinetuneResult,
-    Prepared,
-    Settings,
-    Watch,
-    activations_before,
-    activations_of,
-    open_probe,
-    prepare,
-    sgm_blocks,
-    train,
-)
+from qsgm.finetuning import FinetuneResult, train
 from qsgm.folded import FloatArray, float_trace
 from qsgm.observers import CALIBRATORS, SgmObservers
+from qsgm.preparing import Prepared, Watch, prepare
+from qsgm.probing import Exchanged, activations_before, activations_of, open_probe
 from qsgm.quantize import (
     ACTIVATION_BITS,
     WEIGHT_BITS,
@@ -50,6 +40,7 @@ from qsgm.quantize import (
 )
 from qsgm.recalibration import GROWTH, grown, ranges_of
 from qsgm.report import number, plain_table
+from qsgm.settings import Settings, sgm_blocks
 from qsgm.tuning import BATCH
 
 Floats = NDArray[np.float64]

@@ -23,8 +23,10 @@ from qsgm.bench.speed import TORCH, VARIANTS, run_once
 from qsgm.bench.tables import right_table
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import MANIFEST, Bundle, Precision, probe_file
-from qsgm.finetuning import Settings, Watch, peak_activation_bytes, trunk_precision
+from qsgm.finetuning import peak_activation_bytes
+from qsgm.preparing import Watch
 from qsgm.report import number, plain_table
+from qsgm.settings import Settings, trunk_precision
 from qsgm.tuning import BATCH
 
 INT8, FLOAT, BP = VARIANTS

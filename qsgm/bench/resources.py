@@ -23,8 +23,9 @@ from qsgm.bench.step_jobs import step_seconds
 from qsgm.bench.tables import right_table
 from qsgm.blocks import LAYERS
 from qsgm.bundle import FLOAT_BYTES, Bundle
-from qsgm.finetuning import OUTPUTS_PER_CROP, Watch
+from qsgm.finetuning import OUTPUTS_PER_CROP
 from qsgm.folded import FoldedSgm
+from qsgm.preparing import Watch
 from qsgm.quantize import ActivationBits
 from qsgm.report import number
 from qsgm.tuning import BATCH

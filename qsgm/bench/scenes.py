@@ -17,11 +17,13 @@ from qsgm.angles import angle_error
 from qsgm.bench.frames import BenchFrame
 from qsgm.bench.staging import Scene, cut_out, make_scenes
 from qsgm.bundle import Bundle
-from qsgm.finetuning import Settings, Watch, prepare, train
+from qsgm.finetuning import train
 from qsgm.images import write_png
 from qsgm.pictures import draw_detection
 from qsgm.predict import Detection
+from qsgm.preparing import Watch, prepare
 from qsgm.report import number, plain_table
+from qsgm.settings import Settings
 
 # A detection this close to the true centre is one of the object.
 ON_OBJECT_PX = 24.0

@@ -23,8 +23,9 @@ from qsgm.bench.step_jobs import step_seconds
 from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import Settings, Watch, trunk_precision
+from qsgm.preparing import Watch
 from qsgm.report import number, plain_table
+from qsgm.settings import Settings, trunk_precision
 from qsgm.tuning import BATCH
 
 VARIANTS: Mapping[str, Sequence[str]] = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import Bundle, Precision, head_file, step_file
-from qsgm.finetuning import running_graphs
+from qsgm.preparing import running_graphs
 from qsgm.tuning import BATCH, StepLoop
 from qsgm.weights import to_step_layout
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from qsgm.drift import LEAST_COSINE
 from qsgm.files import write_bytes_atomic
-from qsgm.finetuning import STEPS_PER_EPOCH, FinetuneResult
+from qsgm.finetuning import FinetuneResult
+from qsgm.preparing import STEPS_PER_EPOCH
 from qsgm.train.charts import DPI, GREY, SMALL, TEXT
 from qsgm.tuning import BATCH
 

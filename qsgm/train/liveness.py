@@ -27,7 +27,7 @@ from qsgm.bench.memory import StepMemory
 from qsgm.bench.step_jobs import start_of, still_loop
 from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle, Precision, step_file
-from qsgm.finetuning import running_graphs
+from qsgm.preparing import running_graphs
 from qsgm.runtime import session_options
 
 # Their result is their first input under another shape.
