@@ -211,6 +211,8 @@ def model_card(report: ExportReport, provenance: Provenance) -> str:
         rows = calibrator_rows(calibration)
         whose += f"\n\n{markdown(calibrator_headers(calibration), rows)}"
     card = json.dumps(provenance.card, indent=1, sort_keys=True)
+    bits = {layer.int8_sgm.bits for layer in report.layers.values()}
+    planes = "one plane" if bits == {8} else "two planes"
     return f"""# GraspNet with int8 synthetic gradient modules
 
 Standard ONNX graphs for fine-tuning GraspNet on the device, feed-forward; `manifest.json` says what
@@ -220,11 +222,12 @@ is in them. Batchnorm is folded into the convolutions (largest change of any out
 | file | what |
 | --- | --- |
 | `network.onnx` | a frame to its heatmap |
+| `weights.bin` | constants of all other graphs, which open with it beside them only |
 | `trunk_P_N.onnx` | crops to u8 features when the last N layers are tuned, the others in P |
 | `head_N.onnx` | features to outputs |
 | `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step, SGD or Adam; B: layers in blocks |
 | `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
-| `probe_N.onnx` | int8, float and true gradients of a batch |
+| `probe_N.onnx` | int8, float and true gradients of a batch, and the updates they lead to |
 
 ## Made from
 
@@ -242,10 +245,10 @@ How the checkpoint was pretrained, and what it scored:
 
 ## The int8 SGMs
 
-u8 activations, weights of two s8 planes (one holds what rounding to the other left), a scale for
-every channel, float gradients out. Measured while the int8 SGMs
-fine-tuned the last three layers on the calibration frames; behind layers 1 to 3, where there are
-SGMs, on batches along shorter runs of all layers. {LEGEND.capitalize()}.
+u8 activations of {planes}, s8 weights of two planes, a scale for every channel, int32 sums, float
+gradients out. Measured while the int8 SGMs fine-tuned the last three layers on the calibration
+frames; behind layers 1 to 3, where there are SGMs, on batches along shorter runs of all layers.
+{LEGEND[0].upper()}{LEGEND[1:]}.
 
 {lines}
 
