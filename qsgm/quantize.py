@@ -294,7 +294,7 @@ def constants_of_two_planes(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
     """The same of an 8 bit SGM for a 16 bit one's graph, where it gives the same gradients.
 
     Its codes become the high plane, and the low plane's weights are zero. With it calibrations of
-    8 bits can be tried on a bundle of 16.
+    8 bits can be tried on a bundle of 16; but underflow is then counted in steps of 16 bits.
     """
     assert q.bits == 8, "only a single plane is one of two"
     step = np.float32(PLANE_STEPS)

@@ -317,7 +317,7 @@ def table_kinds(folder: Path) -> list[bool]:
 def observe_set(
     images: Sequence[Image], bundle: Bundle, settings: Settings, layers: Sequence[int]
 ) -> Observed:
-    """What each SGM sees in float runs on some frames; one is in memory at a time."""
+    """What each SGM sees in float runs on some frames, whose crops are dropped one by one."""
     total = {layer: SgmObservers(bundle.float_sgm(layer)) for layer in layers}
     for image in images:
         prepared = prepare(image, bundle, settings)

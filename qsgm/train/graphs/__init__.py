@@ -8,5 +8,6 @@ sgm        a static SGM in float and in int8
 optimizers SGD with momentum and Adam, one parameter at a time
 step       a whole training step, block by block; one block is backpropagation
 probe      the gradients that an SGM should give, and gives in float and int8; bare outputs
+sharing    constants of all graphs in one file
 inspection which operators ONNX Runtime makes of a graph
 """
