@@ -50,7 +50,7 @@ def probe_model(
     Inputs are those of :mod:`qsgm.train.graphs.step` without rates and moments. Outputs for every
     SGM's layer k: `activation{k}`, `true{k}`, `float{k}`, `int8{k}`, each (B, P, C);
     `update_true{k}` and so on, the gradients of the layer's weight and bias that these lead to,
-    each (C, K + 1), the bias's last, summed over the batch; and `clipped{k}` and `underflow{k}`, the
+    each (C, K + 1), the bias's last, summed over the batch; `clipped{k}` and `underflow{k}`, the
     fractions of the int8 SGM's inputs that lay outside its ranges, and that were rounded to 0.
 
     Raises:

@@ -2,7 +2,7 @@
 
 Inputs: `features` (N, P, C) and `labels` (N, 3) of all crops; `rows` (B,), the batch; one scalar
 `rate{k}` per layer; and the state, in which `weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the
-layer's and everything else starts at zero. All are float32, but for `rows`, int64, and the features,
+layer's and everything else starts at zero. All are float32, but for `rows`, int64, and features,
 which are u8 codes or pixels. Which inputs are state shows in the outputs' names.
 Outputs: every state under its name with `_next`; `loss`, the batch's mean before the update.
 """
