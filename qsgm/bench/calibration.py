@@ -71,8 +71,7 @@ COS_FLOAT, COS_TRUE, CLIPPED, DETECTION, ANGLE, WARNED = range(len(METRICS))
 LEGEND = """N/M: bits of activations/weights; means over frames; cos: of int8 to float
 gradients, and the worst frame's; true: to true ones; clip: share of inputs
 outside their ranges, in %; angle: error in degrees, modulo 180°; lost: share of
-frames worse than with float SGMs; warned: share of frames the drift watch fired
-on"""
+frames worse than with float SGMs; warned: share of frames with a warning"""
 
 
 @dataclass(frozen=True)
