@@ -15,7 +15,7 @@ from rich.console import Console
 
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
-from qsgm.cli import CalibratorName
+from qsgm.cli.options import CalibratorName
 from qsgm.files import check_replaceable
 from qsgm.folded import FloatArray, float_trace
 from qsgm.images import read_frame, write_png

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from qsgm import __version__, cli, finetuning
+from qsgm import __version__, cli, finetuning, paths
 from qsgm.bundle import NETWORK, trunk_file
+from qsgm.cli import commands, console
 from qsgm.errors import QsgmError
 from qsgm.settings import Settings
 
@@ -443,7 +444,7 @@ def test_host_commands_say_what_to_install_when_torch_is_missing(
     def without_torch(_: str) -> None:
         raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
 
-    monkeypatch.setattr(cli, "importlib", SimpleNamespace(import_module=without_torch))
+    monkeypatch.setattr(console, "importlib", SimpleNamespace(import_module=without_torch))
     for command in (("pretrain",), ("fold-and-quantize", "sgm.pt")):
         assert_refused(
             qsgm(*command), 1, "needs torch", "pip install -c constraints.txt '.[train]'"
@@ -454,7 +455,7 @@ def test_a_bug_is_not_hidden(qsgm: Run, monkeypatch: pytest.MonkeyPatch, frame_p
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cli, "_bundle", broken)
+    monkeypatch.setattr(commands, "open_bundle", broken)
     with pytest.raises(ZeroDivisionError):
         qsgm("finetune", frame_path)
 
@@ -462,7 +463,7 @@ def test_a_bug_is_not_hidden(qsgm: Run, monkeypatch: pytest.MonkeyPatch, frame_p
 def test_the_progress_says_nothing_unless_it_is_on_a_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with cli._progress() as watch:
+    with console.progress() as watch:
         watch("crops", 1, 2)
         watch("meta", 1, 2, {"loss": 0.5})
     assert capsys.readouterr() == ("", "")
@@ -538,7 +539,7 @@ def test_an_object_that_cannot_be_remembered_is_still_written(
     def fail(_: Path) -> None:
         raise QsgmError("no home")
 
-    monkeypatch.setattr(cli.paths, "remember_object", fail)
+    monkeypatch.setattr(paths, "remember_object", fail)
     outcome = qsgm(
         "finetune", "--json", "--epochs", 0, "--bundle", bundle_folder,
         "-o", tmp_path / "bar", frame_path,
@@ -590,7 +591,7 @@ def test_defaults_of_the_command_line_are_those_of_the_library(
         seen.append(settings)
         raise QsgmError("enough")
 
-    monkeypatch.setattr(cli, "_finetune", stop)
+    monkeypatch.setattr(commands, "_finetune", stop)
     qsgm("finetune", "--bundle", bundle_folder, frame_path)
     assert seen == [Settings()]
 

@@ -1,0 +1,5 @@
+"""`python -m qsgm.cli`."""
+
+from qsgm.cli import main
+
+main()

@@ -1,0 +1,355 @@
+"""`qsgm bench`: what the README states, measured."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from qsgm import defaults, paths
+from qsgm.cli.console import host_module, open_bundle, progress, show, write_report
+from qsgm.cli.options import (
+    BundleOption,
+    EpochsOption,
+    FramesOption,
+    JsonOption,
+    LayersOption,
+    LimitOption,
+    MethodName,
+    MethodOption,
+    OptimizerOption,
+    PrecisionOption,
+    ReportOption,
+    SeedOption,
+    ThreadsOption,
+    TrunkOption,
+    parsed_blocks,
+    parsed_layer_counts,
+    parsed_run_lengths,
+    parsed_variant,
+    settings_of,
+    value_of,
+)
+
+if TYPE_CHECKING:
+    from qsgm.bench.frames import BenchFrame
+
+app = typer.Typer(help="Measure what the README states.")
+
+
+@app.command("accuracy")
+def bench_accuracy(
+    frames: FramesOption = None,
+    layers: LayersOption = defaults.LAYERS,
+    trunk: TrunkOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    short: Annotated[
+        str, typer.Option(metavar="N,N", help="Epochs of further, shorter runs; '' for none.")
+    ] = defaults.SHORT_RUNS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Draw learning curves here, JSON beside (matplotlib)."),
+    ] = None,
+    per_frame: Annotated[bool, typer.Option("--per-frame", help="A line per frame, too.")] = False,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Untouched, SGM in int8 and float, backpropagation: on the same crops of every frame.
+
+    Every run length is a run of its own, its rates decaying to nothing at its end. `bp best` is
+    backpropagation with the optimizer and rate of a small grid that do best on these very frames:
+    more than any user could know beforehand.
+    """
+    from qsgm.bench.accuracy import measure_accuracy
+    from qsgm.bench.accuracy_report import accuracy_report_json, render
+    from qsgm.settings import Settings
+
+    charts = None if pictures is None else host_module("qsgm.train.charts")
+    lengths = parsed_run_lengths(short)
+    some = frames_of(frames, limit)
+    settings = Settings(
+        layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
+    )
+    with progress() as watch:
+        report = measure_accuracy(some, open_bundle(bundle), settings, lengths, watch)
+    values = accuracy_report_json(report)
+    show(values, render(report, per_frame), as_json)
+    write_report(values, output)
+    if pictures is not None and charts is not None:
+        charts.write_learning_curves(report, pictures / "learning_curves.png")
+        write_report(values, pictures / "accuracy.json")
+
+
+@app.command("layers")
+def bench_layers(
+    frames: FramesOption = None,
+    blocks: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B,C", help="Layers in groups; repeatable. Else: all singles."),
+    ] = None,
+    int8: PrecisionOption = None,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Static SGMs with more and more layers tuned, or in the blocks given, on every frame."""
+    from qsgm.bench.layers import measure_layers
+
+    some = frames_of(frames, limit)
+    loaded = open_bundle(bundle)
+    asked = blocks or [text for text in loaded.blocks if "-" not in text]
+    divisions = [parsed_blocks(text) for text in asked]
+    settings = settings_of(
+        int8, MethodName.SGM, defaults.LAYERS, optimizer, epochs, seed, None, threads
+    )
+    with progress() as watch:
+        report = measure_layers(some, loaded, settings, divisions, watch)
+    show(report.to_json(), report.render(), as_json)
+    write_report(report.to_json(), output)
+
+
+@app.command("scenes")
+def bench_scenes(
+    frames: FramesOption = None,
+    scenes: Annotated[int, typer.Option(min=1, max=1000, help="With the object, per frame.")] = 3,
+    int8: PrecisionOption = None,
+    method: MethodOption = MethodName.SGM,
+    layers: LayersOption = defaults.LAYERS,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write some pictures here.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Teach on every frame, find its object in scenes made from it, and not on the empty table."""
+    from qsgm.bench.scenes import measure_scenes
+
+    some = frames_of(frames, limit)
+    settings = settings_of(int8, method, layers, optimizer, epochs, seed, None, threads)
+    with progress() as watch:
+        report = measure_scenes(some, open_bundle(bundle), settings, scenes, watch, output)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("speed")
+def bench_speed(
+    frames: FramesOption = None,
+    layers: LayersOption = defaults.LAYERS,
+    trunk: TrunkOption = None,
+    epochs: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Passes over 800 crops.")
+    ] = defaults.EPOCHS,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of every variant.")] = 5,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Seconds per stage on the first frame, next to the same job in torch if it is installed."""
+    from qsgm.bench.speed import measure_speed, render
+    from qsgm.settings import Settings
+
+    frame = frames_of(frames, 1)[0].path
+    settings = Settings(
+        layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
+    )
+    with progress() as watch:
+        report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch)
+    write_report(report, output)
+    show(report, render(report), as_json)
+
+
+@app.command("resources")
+def bench_resources(
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Steps of every variant.")] = 15,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Operations, bytes and time of layers and SGMs: the paper's Table 3, and this bundle's."""
+    from qsgm.bench.resources import measure_resources
+
+    with progress() as watch:
+        report = measure_resources(open_bundle(bundle), repeats, threads, watch)
+    write_report(report.to_json(), output)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("memory")
+def bench_memory(
+    frames: FramesOption = None,
+    processes: Annotated[
+        str,
+        typer.Option(metavar="N,N", help="Tuned layers of whole processes; '' for none."),
+    ] = "3,6",
+    trunk: TrunkOption = None,
+    epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Of the processes.")] = 1,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the peaks, a PNG (matplotlib).")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
+    from qsgm.bench.memory import measure_memory
+    from qsgm.settings import Settings
+
+    lengths = parsed_layer_counts(processes)
+    host = host_module("qsgm.train.liveness")
+    chart = None if picture is None else host_module("qsgm.train.memory_chart")
+    frame = frames_of(frames, 1)[0].path
+    settings = Settings(trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads)
+    with progress() as watch:
+        report = measure_memory(
+            frame, open_bundle(bundle), settings, lengths, host.step_memory, watch
+        )
+    write_report(report.to_json(), output)
+    if picture is not None and chart is not None:
+        chart.write_memory_chart(report, picture)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("fidelity")
+def bench_fidelity(
+    frames: FramesOption = None,
+    layers: Annotated[
+        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
+    ] = defaults.LAYERS,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """int8 gradients against float and true ones along a run on every frame, worst cases named."""
+    from qsgm.bench.fidelity import measure_fidelity
+    from qsgm.settings import Settings
+
+    some = frames_of(frames, limit)
+    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    with progress() as watch:
+        report = measure_fidelity(some, open_bundle(bundle), settings, watch)
+    write_report(report.to_json(), output)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("calibration")
+def bench_calibration(
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR", help="To judge on: none calibrated on.")
+    ],
+    calib: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
+    ] = None,
+    variants: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--variant", metavar="A/W/NAME", help="Bits and calibrator; repeatable. Else: eight."
+        ),
+    ] = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the study, a PNG (matplotlib).")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
+    from qsgm.bench.calibration import VARIANTS, measure_calibration
+    from qsgm.bench.frames import list_frames
+    from qsgm.settings import Settings
+
+    chart = None if picture is None else host_module("qsgm.train.calibration_chart")
+    folder = paths.calibration_folder(calib)
+    some = list_frames(frames, limit)
+    settings = Settings(epochs=epochs, seed=seed, threads=threads)
+    chosen = [parsed_variant(text) for text in variants] if variants else VARIANTS
+    with progress() as watch:
+        report = measure_calibration(some, folder, open_bundle(bundle), settings, watch, chosen)
+    write_report(report.to_json(), output)
+    if picture is not None and chart is not None:
+        chart.write_calibration_chart(report, picture)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("baselines")
+def bench_baselines(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="sgm.pt", help="Gives the start and the static SGMs.")
+    ],
+    frames: FramesOption = None,
+    layers: Annotated[int, typer.Option(min=2, max=4, help="How many to tune.")] = defaults.LAYERS,
+    epochs: EpochsOption = defaults.EPOCHS,
+    limit: LimitOption = None,
+    seed: SeedOption = 0,
+    output: ReportOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Other systems on the same crops: online SGMs, feedback alignment, target projection (host).
+
+    All in float and in torch, each at the best of a few optimizers and rates on these frames.
+    """
+    host = host_module("qsgm.train.baselines.comparison")
+    loaded = host_module("qsgm.train.checkpoint").load_checkpoint(checkpoint)
+    some = frames_of(frames, limit)
+    with progress() as watch:
+        tasks = host.tasks_of(loaded, some, layers, seed, watch)
+        rows = host.compare(loaded, tasks, layers, epochs, seed, watch)
+    values = host.to_json(rows, len(some), epochs)
+    show(values, host.render(rows, len(some)), as_json)
+    write_report(values, output)
+
+
+@app.command("paper")
+def bench_paper(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Sizes at which it runs in seconds and means nothing.")
+    ] = False,
+    sheet: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a picture of the objects here.")
+    ] = None,
+    seed: SeedOption = 0,
+    output: ReportOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The paper's tables again, on drawn objects, and its other systems (host; needs torch)."""
+    experiment = host_module("qsgm.train.paper.experiment")
+    host = host_module("qsgm.train.paper.report")
+    config = experiment.QUICK if quick else experiment.PaperConfig()
+    if sheet is not None:
+        host.write_sheet(sheet, config)
+    with progress() as watch:
+        results = experiment.measure_paper(config, seed, watch)
+    write_report(host.to_json(results), output)
+    show(host.to_json(results), host.render(results), as_json)
+
+
+def frames_of(folder: Path | None, limit: int | None) -> list["BenchFrame"]:
+    """Demonstrations of a folder, or the calibration set's."""
+    from qsgm.bench.frames import list_frames
+
+    return list_frames(paths.calibration_folder() if folder is None else folder, limit)

@@ -1,0 +1,286 @@
+"""The commands themselves; those of `bench` are in :mod:`qsgm.cli.bench`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from qsgm import defaults, paths
+from qsgm.cli.console import (
+    complain,
+    host_module,
+    open_bundle,
+    print_json,
+    progress,
+    show,
+    write_report,
+)
+from qsgm.cli.options import (
+    ActivationBitsChoice,
+    BlocksOption,
+    BundleOption,
+    CalibratorName,
+    CenterOption,
+    Device,
+    Encoding,
+    EpochsOption,
+    FrameArgument,
+    JsonOption,
+    MethodName,
+    MethodOption,
+    OptimizerOption,
+    PrecisionOption,
+    RecalibrateOption,
+    ReportOption,
+    SceneArgument,
+    SeedOption,
+    ThreadsOption,
+    TrunkOption,
+    parsed_blocks,
+    parsed_channels,
+    settings_of,
+    tuned_layers,
+)
+from qsgm.errors import QsgmError
+
+if TYPE_CHECKING:
+    from qsgm.bundle import Bundle
+    from qsgm.finetuning import FinetuneResult
+    from qsgm.settings import Settings
+
+app = typer.Typer()
+
+
+@app.command()
+def pretrain(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE")] = Path("sgm.pt"),
+    seed: SeedOption = 0,
+    device: Annotated[Device, typer.Option(help="For the backbone.")] = Device.CPU,
+    encoding: Annotated[
+        Encoding, typer.Option(help="Of the angle: the paper's breaks at 90 degrees.")
+    ] = Encoding.DOUBLE,
+    hidden: Annotated[
+        str | None,
+        typer.Option(metavar="N,N", help="Channels of the SGMs' hidden layers, such as 64,64."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Pretrain network and SGMs on drawn objects (host; needs torch).
+
+    What was interrupted goes on where it stopped when the same command runs again.
+    """
+    chosen = {} if hidden is None else {"hidden": parsed_channels(hidden)}
+    host = host_module("qsgm.train.pretrain")
+    config, loss = host.PretrainConfig(**chosen), host.Loss(encoding=encoding.value)
+    with progress() as watch:
+        host.pretrain(output, seed, device.value, watch, config=config, loss=loss)
+    if as_json:
+        print_json({"output": str(output), "seed": seed, "device": device.value})
+    else:
+        typer.echo(f"pretrained: {output}")
+
+
+@app.command("draw-calibration")
+def draw_calibration(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("calib"),
+    count: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Frames.")
+    ] = defaults.CALIBRATION_FRAMES,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a calibration set and the demo's two pictures (host)."""
+    host = host_module("qsgm.train.draw_calibration")
+    with progress() as watch:
+        host.draw_calibration_set(output, count, seed, watch)
+    if as_json:
+        print_json({"output": str(output), "frames": count, "seed": seed})
+    else:
+        typer.echo(f"calibration set: {output}")
+
+
+@app.command("fold-and-quantize")
+def fold_and_quantize(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="SGM.PT", help="What `qsgm pretrain` wrote.")
+    ],
+    calib: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Calibration set; default: the shipped one.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")] = Path("export"),
+    blocks: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A-B,C", help="Also export steps for these blocks; repeatable."),
+    ] = None,
+    calibrator: Annotated[
+        CalibratorName,
+        typer.Option(help="Whose ranges; auto: each SGM's best one on held-out frames."),
+    ] = CalibratorName.AUTO,
+    activation_bits: Annotated[
+        ActivationBitsChoice, typer.Option(help="Of the int8 SGMs: one u8 plane, or two.")
+    ] = ActivationBitsChoice.SIXTEEN,
+    as_json: JsonOption = False,
+) -> None:
+    """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
+    more = [parsed_blocks(text) for text in blocks or ()]
+    host = host_module("qsgm.train.export")
+    calibration = paths.calibration_folder(calib)
+    with progress() as watch:
+        report = host.fold_and_quantize(
+            checkpoint,
+            calibration,
+            output,
+            watch,
+            blocks=more,
+            calibrator=calibrator.value,
+            activation_bits=int(activation_bits.value),
+        )
+    show(report.to_json(), report, as_json)
+
+
+@app.command()
+def finetune(
+    frame: FrameArgument,
+    int8: PrecisionOption = None,
+    method: MethodOption = MethodName.SGM,
+    layers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=defaults.MOST_LAYERS,
+            help="How many of the last to tune.",
+            show_default=str(defaults.LAYERS),
+        ),
+    ] = None,
+    blocks: BlocksOption = None,
+    trunk: TrunkOption = None,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    recalibrate: RecalibrateOption = False,
+    seed: SeedOption = 0,
+    center: CenterOption = None,
+    bundle: BundleOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Default: among this user's objects."),
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Tune the network to the object in one frame, on the device."""
+    from qsgm.files import check_replaceable
+    from qsgm.report import finetune_json, finetune_report
+    from qsgm.tuned import DESCRIPTION
+
+    tuned = tuned_layers(layers, blocks)
+    settings = settings_of(
+        int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
+    )
+    settings = replace(settings, recalibrate=recalibrate)
+    folder = paths.object_folder(frame) if output is None else output
+    check_replaceable(folder, DESCRIPTION)
+    result = _finetune(frame, open_bundle(bundle), settings)
+    name = folder.name if output is None else frame.stem
+    report = finetune_json(result, name, folder)
+    result.save(folder, name)
+    _remember(folder, chosen=output is not None)
+    show(report, finetune_report(result, name), as_json)
+    if not as_json:
+        typer.echo(f"tuned object: {folder}")
+
+
+@app.command()
+def predict(
+    scene: SceneArgument,
+    tuned: Annotated[
+        Path | None,
+        typer.Option("--object", metavar="DIR", help="Tuned object; default: the last one."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the tuned object: where it is, how far to move, how far to turn."""
+    from qsgm.images import read_frame, write_png
+    from qsgm.pictures import draw_detection
+    from qsgm.report import detection_table, predict_json
+    from qsgm.tuned import load_object
+
+    found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
+    frame = read_frame(scene)
+    detection, heatmap = found.locate(frame)
+    name = found.description.name
+    if output is not None:
+        write_png(output, draw_detection(frame, heatmap, detection, name))
+    report = predict_json(detection, heatmap.shape, name, output)
+    show(report, detection_table(detection, name), as_json)
+    if output is not None and not as_json:
+        typer.echo(f"picture: {output}")
+
+
+@app.command()
+def fidelity(
+    frame: FrameArgument,
+    int8: PrecisionOption = None,
+    layers: Annotated[
+        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
+    ] = defaults.LAYERS,
+    trunk: TrunkOption = None,
+    optimizer: OptimizerOption = None,
+    epochs: EpochsOption = defaults.EPOCHS,
+    seed: SeedOption = 0,
+    center: CenterOption = None,
+    bundle: BundleOption = None,
+    every: Annotated[
+        int, typer.Option(min=1, help="Steps from one probe to the next; 25 are an epoch.")
+    ] = defaults.PROBE_EVERY,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the metrics over the run, a PNG (matplotlib)."),
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
+    from qsgm.report import fidelity_command_json, fidelity_command_report
+
+    chart = None if picture is None else host_module("qsgm.train.fidelity_chart")
+    settings = settings_of(
+        int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads, trunk=trunk
+    )
+    result = _finetune(frame, open_bundle(bundle), replace(settings, probe_every=every))
+    if not result.probes:
+        raise QsgmError(
+            f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
+            "there is nothing to compare; export it again with `qsgm fold-and-quantize`"
+        )
+    report = fidelity_command_json(result, frame.stem)
+    if picture is not None and chart is not None:
+        chart.write_fidelity_chart(result, frame.stem, picture)
+    write_report(report, output)
+    show(report, fidelity_command_report(result), as_json)
+    if picture is not None and not as_json:
+        typer.echo(f"picture: {picture}")
+
+
+def _finetune(frame: Path, bundle: "Bundle", settings: "Settings") -> "FinetuneResult":
+    from qsgm.finetuning import finetune as run_finetune
+    from qsgm.images import read_demonstration
+
+    demonstration = read_demonstration(frame)
+    with progress() as watch:
+        return run_finetune(demonstration, bundle, settings, watch)
+
+
+def _remember(folder: Path, *, chosen: bool) -> None:
+    """Make this the object that `predict` uses; with `-o` that is a convenience, not the point."""
+    try:
+        paths.remember_object(folder)
+    except QsgmError as error:
+        if not chosen:
+            raise
+        complain(f"note: `qsgm predict` will need --object {folder}: {error}")

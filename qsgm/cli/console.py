@@ -1,0 +1,104 @@
+"""What the commands say: results to stdout, progress and complaints to stderr."""
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from qsgm import paths
+from qsgm.errors import QsgmError
+
+if TYPE_CHECKING:
+    from qsgm.bundle import Bundle
+
+# library: the extra that brings it
+HOST_LIBRARIES = {"torch": "train", "onnx": "train", "matplotlib": "report"}
+# (stage, done, of how many, values to show)
+Watch = Callable[..., None]
+
+
+def complain(message: str) -> None:
+    """One line on stderr, whatever a file's name may hold."""
+    typer.echo(" ".join(message.splitlines()), err=True)
+
+
+def show(values: dict[str, Any], table: RenderableType, as_json: bool) -> None:
+    """A table for people, or JSON for programs."""
+    if as_json:
+        print_json(values)
+    else:
+        Console().print(table)
+
+
+def print_json(values: dict[str, Any]) -> None:
+    """One JSON object on stdout."""
+    from qsgm.report import to_json
+
+    typer.echo(to_json(values))
+
+
+def write_report(values: dict[str, Any], path: Path | None) -> None:
+    """Write the JSON to a file, if one was asked for."""
+    from qsgm.files import write_text_atomic
+    from qsgm.report import to_json
+
+    if path is not None:
+        write_text_atomic(path, to_json(values) + "\n")
+
+
+def open_bundle(folder: Path | None) -> "Bundle":
+    """The bundle asked for, or the shipped one."""
+    from qsgm.bundle import load_bundle
+
+    return load_bundle(paths.bundle_folder(folder))
+
+
+def host_module(name: str) -> Any:
+    """A module of the host side, or one line saying what it takes."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in HOST_LIBRARIES:
+            raise
+        raise QsgmError(
+            f"this command runs on the host and needs {missing}, which is not installed: "
+            f"pip install -c constraints.txt '.[{HOST_LIBRARIES[missing]}]' in a checkout"
+        ) from error
+
+
+@contextmanager
+def progress() -> Iterator[Watch]:
+    """A bar per stage on stderr, on a terminal only; yields what is told about progress."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:>10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[values]}"),
+    )
+    tasks: dict[str, TaskID] = {}
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+
+        def watch(stage: str, done: int, of: int, values: dict[str, float] | None = None) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=of, values="")
+            shown = "  ".join(f"{name} {value:.4g}" for name, value in (values or {}).items())
+            progress.update(tasks[stage], completed=done, total=of, values=shown)
+
+        yield watch

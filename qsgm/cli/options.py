@@ -1,0 +1,247 @@
+"""What the commands take: choices, options, and what their texts mean."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from qsgm import defaults
+from qsgm.cli.console import complain
+from qsgm.errors import QsgmError
+
+if TYPE_CHECKING:
+    from qsgm.bench.calibration import Variant
+    from qsgm.blocks import Blocks
+    from qsgm.bundle import Precision
+    from qsgm.settings import Settings
+
+LARGEST_HIDDEN = 1024
+LARGEST_SEED = 2**31 - 1  # what numpy and torch take both
+
+
+class MethodName(StrEnum):
+    """Where the tuned layers get their gradients from."""
+
+    SGM = "sgm"
+    BP = "bp"
+
+
+class OptimizerChoice(StrEnum):
+    """What is done with the gradients."""
+
+    SGD = "sgd"
+    ADAM = "adam"
+
+
+class TrunkChoice(StrEnum):
+    """How the frozen layers are computed."""
+
+    INT8 = "int8"
+    FLOAT = "float"
+
+
+class Encoding(StrEnum):
+    """What the two angle channels stand for."""
+
+    DOUBLE = "double"
+    PAPER = "paper"
+
+
+class CalibratorName(StrEnum):
+    """Whose ranges int8 SGMs get."""
+
+    AUTO = "auto"
+    MINMAX = "minmax"
+    PERCENTILE = "percentile"
+    MSE = "mse"
+    ENTROPY = "entropy"
+
+
+class ActivationBitsChoice(StrEnum):
+    """Of int8 SGMs' inputs and hidden tensors."""
+
+    EIGHT = "8"
+    SIXTEEN = "16"
+
+
+class Device(StrEnum):
+    """Where pretraining runs."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+FrameArgument = Annotated[
+    Path, typer.Argument(metavar="OBJECT.PNG", help="One frame with the object at its centre.")
+]
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at.")]
+BundleOption = Annotated[
+    Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
+]
+PrecisionOption = Annotated[
+    bool | None,
+    typer.Option("--int8/--float", help="Precision of the SGMs.", show_default="int8"),
+]
+MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
+LayersOption = Annotated[
+    int, typer.Option(min=1, max=defaults.MOST_LAYERS, help="How many of the last to tune.")
+]
+BlocksOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A-B,C",
+        help="Groups of the last layers that share one gradient, such as 1-4,5,6; default: none.",
+    ),
+]
+TrunkOption = Annotated[
+    TrunkChoice | None, typer.Option(help="Precision of the frozen layers; default: the bundle's.")
+]
+RecalibrateOption = Annotated[
+    bool, typer.Option("--recalibrate", help="Fit the int8 SGMs' ranges to this object's crops.")
+]
+OptimizerOption = Annotated[
+    OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
+]
+EpochsOption = Annotated[int, typer.Option(min=0, max=10_000, help="Passes over 800 crops.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=LARGEST_SEED, help="Of everything drawn at random.")
+]
+CenterOption = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y", help="Object's centre in px; default: the frame's centre."),
+]
+ThreadsOption = Annotated[int, typer.Option(min=1, max=256, help="Of ONNX Runtime.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+FramesOption = Annotated[
+    Path | None,
+    typer.Option("--frames", metavar="DIR", help="Demonstrations; default: the calibration set."),
+]
+LimitOption = Annotated[int | None, typer.Option(min=1, help="At most so many of the frames.")]
+ReportOption = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Also write the JSON here.")
+]
+
+
+def settings_of(
+    int8: bool | None,
+    method: MethodName,
+    layers: int,
+    optimizer: OptimizerChoice | None,
+    epochs: int,
+    seed: int,
+    center: str | None,
+    threads: int,
+    blocks: str | None = None,
+    trunk: TrunkChoice | None = None,
+) -> "Settings":
+    """The settings that a command's options come to."""
+    from qsgm.settings import Settings
+
+    if method is MethodName.BP and int8:
+        complain("note: backpropagation runs in float; --int8 concerns SGMs only")
+    return Settings(
+        method=method.value,
+        precision="float" if int8 is False or method is MethodName.BP else "int8",
+        layers=layers,
+        blocks=blocks,
+        trunk=value_of(trunk),
+        optimizer=None if optimizer is None else optimizer.value,
+        epochs=epochs,
+        seed=seed,
+        center_px=parsed_center(center),
+        threads=threads,
+    )
+
+
+def value_of(trunk: TrunkChoice | None) -> "Precision | None":
+    """A choice as the settings have it."""
+    return None if trunk is None else trunk.value
+
+
+def tuned_layers(layers: int | None, blocks: str | None) -> int:
+    """How many layers to tune: the blocks, if given, say it."""
+    if blocks is None:
+        return defaults.LAYERS if layers is None else layers
+    held = len(parsed_blocks(blocks).layers)
+    if layers not in (None, held):
+        raise typer.BadParameter(
+            f"{blocks} is {held} layers, but --layers says {layers}", param_hint="'--blocks'"
+        )
+    return held
+
+
+def parsed_blocks(text: str) -> "Blocks":
+    """Layers in groups, such as 1-4,5,6."""
+    from qsgm.blocks import parse_blocks
+
+    try:
+        return parse_blocks(text)
+    except QsgmError as error:
+        raise typer.BadParameter(str(error), param_hint="'--blocks'") from error
+
+
+def parsed_variant(text: str) -> "Variant":
+    """Bits and calibrator, such as 8/16/minmax."""
+    from qsgm.bench.calibration import parse_variant
+
+    try:
+        return parse_variant(text)
+    except QsgmError as error:
+        raise typer.BadParameter(str(error), param_hint="'--variant'") from error
+
+
+def parsed_channels(text: str) -> tuple[int, ...]:
+    """Channels of hidden layers, such as 64,64."""
+    channels = numbers(text)
+    if not all(1 <= count <= LARGEST_HIDDEN for count in channels):
+        raise typer.BadParameter(
+            f"{text!r} gives no channels: expected numbers of 1 to {LARGEST_HIDDEN}, such as 64,64",
+            param_hint="'--hidden'",
+        )
+    return channels
+
+
+def parsed_run_lengths(text: str) -> tuple[int, ...]:
+    """Epochs of runs, such as 1,3, or none."""
+    lengths = numbers(text) if text else ()
+    if not all(length >= 1 for length in lengths):
+        raise typer.BadParameter(
+            f"{text!r} gives no run lengths: expected numbers of epochs, such as 1,3",
+            param_hint="'--short'",
+        )
+    return lengths
+
+
+def parsed_layer_counts(text: str) -> tuple[int, ...]:
+    """How many layers to tune, such as 3,6, or none."""
+    counts = numbers(text) if text else ()
+    if not all(1 <= count <= defaults.MOST_LAYERS for count in counts):
+        raise typer.BadParameter(
+            f"{text!r} gives no numbers of layers: expected 1 to {defaults.MOST_LAYERS}, such as "
+            "3,6",
+            param_hint="'--processes'",
+        )
+    return counts
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Whole numbers between commas; a lone 0, which no option takes, for what is none."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        return (0,)
+
+
+def parsed_center(text: str | None) -> tuple[float, float] | None:
+    """A point (x, y) in px, such as 320,240; None: the middle of the frame."""
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r} is not a point: expected x,y in px, such as 320,240",
+            param_hint="'--center'",
+        ) from error
+    return x, y
