@@ -1,6 +1,5 @@
 """The calibration study at a glance (host): sets against variants, coloured by angle error."""
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
 from qsgm.bench.calibration import ANGLE, CalibrationReport, Floats, Variant
-from qsgm.files import write_bytes_atomic
-from qsgm.train.charts import DPI, GREY, SMALL, TEXT
+from qsgm.train.charts import DPI, GREY, SMALL, TEXT, save_png
 
 WIDTH_INCHES, ROW_INCHES, HEADER_INCHES, FOOTER_INCHES = 9.0, 0.46, 1.0, 0.6
 # White: as good as float; the darkest orange: this many times its angle error.
@@ -25,9 +23,7 @@ def write_calibration_chart(report: CalibrationReport, path: Path) -> None:
     Raises:
         QsgmError: the place cannot be written to.
     """
-    picture = io.BytesIO()
-    calibration_chart(report).savefig(picture, format="png", dpi=DPI)
-    write_bytes_atomic(path, picture.getvalue())
+    save_png(calibration_chart(report), path)
 
 
 def calibration_chart(report: CalibrationReport) -> Figure:

@@ -37,15 +37,24 @@ OPTIMIZERS = {"sgd": "SGD", "adam": "Adam"}
 Errors = dict[str, Floats]
 
 
+def save_png(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG file, whole or not at all.
+
+    Raises:
+        QsgmError: the place cannot be written to.
+    """
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=DPI)  # a bare figure: by Agg
+    write_bytes_atomic(path, picture.getvalue())
+
+
 def write_learning_curves(report: AccuracyReport, path: Path) -> None:
     """Write the picture of :func:`learning_curves` as a PNG file, 1800 pixels wide.
 
     Raises:
         QsgmError: the place cannot be written to.
     """
-    picture = io.BytesIO()
-    learning_curves(report).savefig(picture, format="png", dpi=DPI)  # a bare figure: by Agg
-    write_bytes_atomic(path, picture.getvalue())
+    save_png(learning_curves(report), path)
 
 
 def learning_curves(report: AccuracyReport) -> Figure:

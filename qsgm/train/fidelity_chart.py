@@ -1,6 +1,5 @@
 """A chart of a run's fidelity, probe by probe (host): small multiples, one colour per SGM layer."""
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,9 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from qsgm.drift import LEAST_COSINE
-from qsgm.files import write_bytes_atomic
 from qsgm.finetuning import FinetuneResult
 from qsgm.preparing import STEPS_PER_EPOCH
-from qsgm.train.charts import DPI, GREY, SMALL, TEXT
+from qsgm.train.charts import DPI, GREY, SMALL, TEXT, save_png
 from qsgm.tuning import BATCH
 
 Floats = NDArray[np.float64]
@@ -131,9 +129,7 @@ def write_fidelity_chart(result: FinetuneResult, name: str, path: Path) -> None:
     Raises:
         QsgmError: the place cannot be written to.
     """
-    picture = io.BytesIO()
-    fidelity_chart(result, name).savefig(picture, format="png", dpi=DPI)  # a bare figure: by Agg
-    write_bytes_atomic(path, picture.getvalue())
+    save_png(fidelity_chart(result, name), path)
 
 
 def fidelity_chart(result: FinetuneResult, name: str) -> Figure:

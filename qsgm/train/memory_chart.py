@@ -1,6 +1,5 @@
 """Memory at a glance (host): a step's peak by the number of tuned layers, and what SGMs save."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from qsgm.bench.memory import BP, FLOAT, INT8, STEPS, MemoryReport, at_best, ratio
-from qsgm.files import write_bytes_atomic
-from qsgm.train.charts import DPI, GREY, SIZE_INCHES, SMALL, TEXT
+from qsgm.train.charts import DPI, GREY, SIZE_INCHES, SMALL, TEXT, save_png
 from qsgm.train.fidelity_chart import apart
 
 # Of Okabe and Ito, which the colour-blind tell apart.
@@ -30,9 +28,7 @@ def write_memory_chart(report: MemoryReport, path: Path) -> None:
     Raises:
         QsgmError: the place cannot be written to.
     """
-    picture = io.BytesIO()
-    memory_chart(report).savefig(picture, format="png", dpi=DPI)
-    write_bytes_atomic(path, picture.getvalue())
+    save_png(memory_chart(report), path)
 
 
 def memory_chart(report: MemoryReport) -> Figure:
