@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,7 +23,7 @@ from qsgm.tuning import short_run_factor
 
 MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"
-VERSION = 3
+VERSION = 4
 NETWORK = "network.onnx"
 WEIGHTS = "weights.bin"
 FLOAT_BYTES = 4
@@ -133,7 +132,8 @@ class Bundle:
                 f"the bundle {self.folder} can tune {self.most_layers} layers at most, not "
                 f"{tuned}; pass --layers {self.most_layers}"
             )
-        if str(blocks) not in self.blocks and blocks != one_block(tuned):
+        whole = {one_block(len(parse_blocks(text).layers)) for text in self.blocks}
+        if str(blocks) not in self.blocks and blocks not in whole:
             raise QsgmError(
                 f"the bundle {self.folder} has no step for the blocks {blocks}; choose one of "
                 f"{' or '.join(self.blocks)}, or export it with `{COMMAND} --blocks {blocks}`"
@@ -153,6 +153,11 @@ class Bundle:
         recipes = self.manifest["recipes"][method]
         name: OptimizerName = optimizer or recipes["optimizer"]
         text = str(blocks or default_blocks(method, tuned))
+        if text not in recipes["rates"].get(name, {}):
+            raise QsgmError(
+                f"the bundle {self.folder} has no rates for {name} on the blocks {text}; pass "
+                f"--optimizer {recipes['optimizer']}"
+            )
         gain = recipes["short_gains"][text] if method == "sgm" and name == "sgd" else 1.0
         return Recipe(name, tuple(recipes["rates"][name][text]), gain)
 
@@ -161,8 +166,14 @@ class Bundle:
     ) -> ort.InferenceSession:
         """An ONNX Runtime session of one of the bundle's graphs.
 
-        `constants` take the place of the graph's own, by initializer name.
+        `constants` take the place of the graph's own, by initializer name. Raises QsgmError where
+        the bundle was made without it.
         """
+        if name not in self.manifest["files"]:
+            raise QsgmError(
+                f"the bundle {self.folder} was made without {name}; pass another --bundle, or make "
+                f"a whole one with `{COMMAND}`"
+            )
         return open_session(self.folder / name, threads, constants or {})
 
     def activation_bits(self, layer: int) -> ActivationBits:
@@ -233,14 +244,13 @@ def load_bundle(folder: Path) -> Bundle:
     return Bundle(folder, manifest)
 
 
-def needed_files(most_layers: int, blocks: Sequence[str]) -> set[str]:
-    """The graphs without which a bundle cannot do what its layers and blocks promise."""
+def needed_files(trunk: Precision, optimizer: OptimizerName, blocks: Sequence[str]) -> set[str]:
+    """The graphs without which a bundle can tune none of its blocks as its recipe says."""
     needed = {NETWORK, WEIGHTS}
-    for tuned in range(1, most_layers + 1):
-        needed |= {head_file(tuned), *(trunk_file(name, tuned) for name in PRECISIONS)}
-    steps = [*map(parse_blocks, blocks), *map(one_block, range(1, most_layers + 1))]
-    for precision, optimizer, one in product(PRECISIONS, OPTIMIZERS, steps):
-        needed.add(step_file(precision, optimizer, one))
+    for one in map(parse_blocks, blocks):
+        tuned = len(one.layers)
+        needed |= {head_file(tuned), trunk_file(trunk, tuned)}
+        needed.add(step_file("int8", optimizer, one))
     return needed
 
 
@@ -254,11 +264,12 @@ def _check_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     for key, (expected, is_sane) in _EXPECTED.items():
         try:
             sane = is_sane(manifest)
-        except (KeyError, TypeError, AttributeError, OSError, QsgmError):
+        except (KeyError, TypeError, ValueError, AttributeError, OSError, QsgmError):
             sane = False
         if not sane:
             raise QsgmError(f"{path}: {key!r} is damaged: expected {expected}; run `{COMMAND}`")
-    needed = needed_files(manifest["most_layers"], manifest["blocks"])
+    optimizer = manifest["recipes"]["sgm"]["optimizer"]
+    needed = needed_files(manifest["trunk"], optimizer, manifest["blocks"])
     missing = sorted(needed - manifest["files"].keys())
     if missing:
         raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
@@ -325,30 +336,27 @@ def _is_place(place: Any, sides: int, size: float) -> bool:
 
 
 def _are_blocks(manifest: Mapping[str, Any]) -> bool:
-    """Whether it names blocks with SGMs, among them each layer on its own for any number."""
-    texts, most = manifest["blocks"], manifest["most_layers"]
-    singles = {str(single_layers(tuned)) for tuned in range(1, most + 1)}
+    """Whether it names blocks, each with an SGM or the last layer alone, of so many layers."""
+    texts = manifest["blocks"]
+    blocks = [parse_blocks(text) for text in texts]
     return (
-        singles <= set(texts)
-        and len(set(texts)) == len(texts)
-        and all(_has_sgms(parse_blocks(text), most) for text in set(texts) - singles)
+        len(set(texts)) == len(texts)
+        and max(len(one.layers) for one in blocks) == manifest["most_layers"]
+        and all(one.sgm_layers or one == one_block(1) for one in blocks)
     )
 
 
-def _has_sgms(blocks: Blocks, most_layers: int) -> bool:
-    return len(blocks.layers) <= most_layers and len(blocks.sgm_layers) > 0
-
-
 def _are_recipes(manifest: Mapping[str, Any]) -> bool:
-    """Whether every method has an optimizer, and rates for it and for whatever it can tune."""
-    tuned = range(1, manifest["most_layers"] + 1)
-    can_tune = {"sgm": manifest["blocks"], "bp": [str(one_block(layers)) for layers in tuned]}
+    """Whether every method has an optimizer, and rates with it for whatever it can tune."""
+    numbers = [len(parse_blocks(text).layers) for text in manifest["blocks"]]
+    can_tune = {"sgm": manifest["blocks"], "bp": [str(one_block(tuned)) for tuned in numbers]}
     for method in get_args(Method):
         recipe = manifest["recipes"][method]
-        if recipe["optimizer"] not in OPTIMIZERS:
+        if recipe["optimizer"] not in OPTIMIZERS or set(recipe["rates"]) - set(OPTIMIZERS):
             return False
-        for optimizer, text in product(OPTIMIZERS, can_tune[method]):
-            rates = recipe["rates"][optimizer][text]
+        if not all(text in recipe["rates"][recipe["optimizer"]] for text in can_tune[method]):
+            return False
+        for text, rates in (one for some in recipe["rates"].values() for one in some.items()):
             if len(rates) != len(parse_blocks(text).layers):
                 return False
             if not all(0 < rate < math.inf for rate in rates):
@@ -363,7 +371,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Mapping[str, Any]], bool]]] = {
     "label_smoothing": ("0 to below 1", lambda found: 0 <= found["label_smoothing"] < 1),
     "most_layers": (f"1 to {MOST_LAYERS}", lambda found: 1 <= found["most_layers"] <= MOST_LAYERS),
     "trunk": (" or ".join(PRECISIONS), lambda found: found["trunk"] in PRECISIONS),
-    "blocks": ("texts such as 5,6 and 4,5-6, each once, for every number of layers", _are_blocks),
+    "blocks": ("texts such as 5,6 and 4,5-6, each once, with most_layers at most", _are_blocks),
     "recipes": ("positive rates, one per tuned layer, for every method", _are_recipes),
 }
 

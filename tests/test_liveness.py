@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qsgm.blocks import one_block, single_layers
+from qsgm.blocks import one_block, parse_blocks, single_layers
 from qsgm.bundle import Bundle
 from qsgm.train.graphs.build import Graph
 from qsgm.train.liveness import Run, live_peak, size_of, step_memory, traced
@@ -168,8 +168,16 @@ def test_with_sgms_one_layer_is_alive_at_the_peak_and_with_backpropagation_sever
 ) -> None:
     sgm = step_memory(bundle, "int8", single_layers(6), 4)
     bp = step_memory(bundle, "float", one_block(6), 4)
-    assert layers_at(dict(sgm.alive)) == {"layer1"}
+    assert layers_at(dict(sgm.alive)) == {"layer1", "batch"}  # and the crops it reads
     assert layers_at(dict(bp.alive)) >= {"layer1", "layer2", "layer3"}
+
+
+def test_the_sgms_peak_of_all_six_layers_is_a_quarter_of_backpropagations_at_most(
+    bundle: Bundle,
+) -> None:
+    most = step_memory(bundle, "float", one_block(6), 32).peak / 4
+    for precision, text in (("int8", "1,2,3,4,5,6"), ("float", "1,2,3,4,5,6"), ("int8", "1-4,5,6")):
+        assert step_memory(bundle, precision, parse_blocks(text), 32).peak < most
 
 
 def test_a_peak_of_larger_batches_grows_with_them(bundle: Bundle) -> None:

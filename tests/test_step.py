@@ -20,7 +20,11 @@ from qsgm.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv, run_folded_sgm
 from qsgm.train.graphs.build import Graph
-from qsgm.train.graphs.inspection import integer_operators, refuse_float_products
+from qsgm.train.graphs.inspection import (
+    all_nodes,
+    integer_operators,
+    refuse_float_products,
+)
 from qsgm.train.graphs.layers import is_positive
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
@@ -436,7 +440,7 @@ def test_gradients_are_carried_back_inside_blocks_only(
 ) -> None:
     """5x5 layers through which a gradient is carried back: those of a block but its first."""
     model = step_model(net, parse_blocks(text), random_sgms(), Loss(), Sgd())
-    kinds = [node.op_type for node in model.graph.node]
+    kinds = [node.op_type for node in all_nodes(model.graph)]
     assert kinds.count("ConvTranspose") == carried_back_through
 
 
@@ -479,6 +483,25 @@ def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
     for name, value in tuned.items():
         np.testing.assert_array_equal(value, exported.feeds[name])
         assert not np.array_equal(value, start[name])
+
+
+def test_the_loop_takes_other_crops_in_the_place_of_those_it_has(net: FoldedNet) -> None:
+    data = random_data(3)
+    model = step_model(net, single_layers(3), quiet(random_sgms()), Loss(), Sgd())
+    start = {
+        name: value.copy()
+        for name, value in Exported(model, net, data).feeds.items()
+        if name in {f"{kind}{k}" for kind in ("weight", "bias") for k in (4, 5, 6)}
+    }
+    rates = {number: RATES[number] for number in (4, 5, 6)}
+    features, labels = data["features"], data["labels"]
+    whole = StepLoop(session(model), features, labels, start, rates)
+    one_by_one = StepLoop(session(model), features[:0], labels[:0], start, rates)
+    for rows in batches(6):
+        one_by_one.put(features[rows], labels[rows])
+        assert one_by_one.step(np.arange(len(rows))) == whole.step(rows)
+    for name, value in whole.weights().items():
+        np.testing.assert_array_equal(one_by_one.weights()[name], value)
 
 
 def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:

@@ -30,8 +30,9 @@ from qsgm.quantize import ActivationBits
 from qsgm.report import number
 from qsgm.tuning import BATCH
 
-# Of an int8 SGM: scales, coarse scales and biases of a row, low end and gain of an input.
-ROW_BYTES, INPUT_BYTES = 12, 8
+# Of an int8 SGM: scale and bias of a row, low end and gain of an input, step and zero point of a
+# low plane.
+ROW_BYTES, INPUT_BYTES, LOW_PLANE_BYTES = 8, 8, 5
 BUNDLE_LEGEND = (
     "k: thousands of multiply-adds, in int8 of a u8 and an s8 number each; w grad: gradient of the "
     "weight; to input: gradient carried back, by backpropagation only; SGM: its constants; SGM "
@@ -172,9 +173,11 @@ def cost_of(bundle: Bundle, shape: Shape) -> Cost:
 
 def int8_bytes(sgm: FoldedSgm, bits: ActivationBits) -> int:
     """Of the constants of an SGM in int8, as :func:`qsgm.quantize.constants` lists them."""
-    weights = sum(conv.weight.size for conv in sgm.convs) * (1 + bits // 8)
+    weights = 2 * sum(conv.weight.size for conv in sgm.convs)
     rows = sum(len(conv.bias) for conv in sgm.convs)
-    return weights + ROW_BYTES * rows + INPUT_BYTES * int(sgm.convs[0].weight.shape[1])
+    low_plane = LOW_PLANE_BYTES if bits == 16 else 0
+    inputs = INPUT_BYTES * int(sgm.convs[0].weight.shape[1])
+    return weights + ROW_BYTES * rows + inputs + low_plane
 
 
 def step_cost(costs: Sequence[Cost], seconds: Mapping[str, float]) -> StepCost:

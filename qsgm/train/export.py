@@ -46,7 +46,7 @@ from qsgm.train.fold import FoldedNet, net_fold_error, run_folded, run_folded_sg
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
-from qsgm.train.graphs.sharing import SharedConstants
+from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import (
     initializer_offsets,
@@ -60,8 +60,6 @@ from qsgm.train.sgm_fidelity import measure
 from qsgm.train.trunk_ranges import observe_trunk
 
 SEED = 0
-# No other folder that qsgm writes holds a file of this name; `manifest.json` is in two kinds.
-MARKER = head_file(1)
 # Of the frozen layers, unless the user says otherwise: in int8 they take longer (README).
 TRUNK: Precision = "float"
 OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
@@ -103,7 +101,7 @@ def fold_and_quantize(
         QsgmError: the checkpoint or the calibration set cannot be used, the output folder holds
             something else, or the exported graphs would not do what they are for.
     """
-    check_replaceable(output_folder, MARKER)
+    check_replaceable(output_folder, WEIGHTS)
     trainee = prepare(load_checkpoint(checkpoint_path))
     exported = exported_blocks(trainee.checkpoint.most_layers, blocks)
     frames = CalibrationSet(calib_folder)
@@ -128,7 +126,7 @@ def fold_and_quantize(
     description = describe(trainee, exported, files) | {"sgms": sgms}
     files[MANIFEST] = (json.dumps(description, indent=1, sort_keys=True) + "\n").encode()
     files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, frames)).encode()
-    with new_folder(output_folder, MARKER) as new:
+    with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
     return report
@@ -244,11 +242,17 @@ def build_steps(
     bent = {"sgd": trainee.checkpoint.curvatures if blocks.sgm_layers else FLAT, "adam": FLAT}
     return {
         step_file(precision, name, blocks): step_model(
-            net, blocks, variants[precision], loss, optimizer, bent[name]
+            net, blocks, variants[precision], loss, OPTIMIZERS[name], bent[name]
         )
         for precision in (PRECISIONS if blocks.sgm_layers else ("float",))
-        for name, optimizer in OPTIMIZERS.items()
+        for name in optimizers_of(blocks)
     }
+
+
+def optimizers_of(blocks: Blocks) -> list[OptimizerName]:
+    """What these blocks are trained with: Adam on each layer on its own, or on all as one."""
+    tuned = len(blocks.layers)
+    return [*OPTIMIZERS] if blocks in (single_layers(tuned), one_block(tuned)) else ["sgd"]
 
 
 def bundle_files(
@@ -258,10 +262,12 @@ def bundle_files(
 ) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Every file of a bundle but its manifest, and what that says of the SGMs.
 
-    Constants lie in one file beside the graphs, which are changed. The network is left whole: a
-    tuned object is a copy of it. The device reads the float SGMs when it calibrates anew.
+    Constants lie in one file beside the graphs, which are changed, or in the network's. That one is
+    left whole: a tuned object is a copy of it. The device reads the float SGMs when it calibrates
+    anew.
     """
-    shared = SharedConstants(WEIGHTS)
+    network = graphs[NETWORK].SerializeToString()
+    shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
     sgms = {
         str(layer): {
             "bits": int8_sgms[layer].bits,
@@ -313,7 +319,11 @@ def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[str, Any]:
     """Default optimizer and rates of both methods, by blocks."""
     sgm = {
         "sgd": {str(one): list(sgm_rates(checkpoint, one)) for one in blocks},
-        "adam": {str(one): [SGM_ADAM_RATE] * len(one.layers) for one in blocks},
+        "adam": {
+            str(one): [SGM_ADAM_RATE] * len(one.layers)
+            for one in blocks
+            if "adam" in optimizers_of(one)
+        },
     }
     whole = [one_block(tuned) for tuned in range(1, checkpoint.most_layers + 1)]
     bp = {

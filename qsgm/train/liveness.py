@@ -4,7 +4,9 @@ The nodes are those that ONNX Runtime makes of the graph, in the order in which 
 the shapes they really give: from the optimized model and the profile of one step. A tensor lives
 from the node that makes it to the last one that reads it. Views (:data:`VIEWS`) are their input;
 where a kernel may write over an input (:data:`IN_PLACE`) that nobody reads any more, it does. Not
-counted: constants, the graph's inputs, its bound outputs, and what a kernel needs for itself.
+counted: constants, the graph's inputs, its bound outputs, and what a kernel needs for itself. Of
+a loop's rounds, which are all alike, the first one stands for all; what it gives lies in the loop's
+own results from the start.
 
 The same profile says what the runtime asked its allocator for, against which this is checked.
 """
@@ -29,6 +31,7 @@ from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle, Precision, step_file
 from qsgm.preparing import running_graphs
 from qsgm.runtime import session_options
+from qsgm.train.graphs.inspection import all_nodes, bodies
 
 # Their result is their first input under another shape.
 VIEWS = frozenset({"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"})
@@ -125,12 +128,16 @@ def traced(model: Path, use: Callable[[ort.InferenceSession], object], threads: 
 
 def read_trace(graph: onnx.GraphProto, events: Sequence[Mapping[str, Any]]) -> Trace:
     """A graph's nodes in the order of their events, and what was in use in each run of them."""
-    nodes = {node.name: node for node in graph.node}
-    assert len(nodes) == len(graph.node), "ONNX Runtime gives every node a name of its own"
-    length = len(nodes)  # there are no branches: every run takes every node
-    assert len(events) % length == 0, "a run of the profile is incomplete"
-    runs = [run_of(nodes[event["name"].removesuffix(KERNEL)], event) for event in events[:length]]
-    bound = frozenset(output.name for output in graph.output)
+    every = [*all_nodes(graph)]
+    nodes = {node.name: node for node in every}
+    assert len(nodes) == len(every), "ONNX Runtime gives every node a name of its own"
+    names = [event["name"].removesuffix(KERNEL) for event in events]
+    # There are no branches: every run takes every node, and loops always the same rounds.
+    length = len(events) // names.count(graph.node[-1].name)
+    assert names[:length] * (len(events) // length) == names, "a run of the profile is incomplete"
+    first = {name: run_of(nodes[name], event) for name, event in zip(names[:length], events)}
+    runs = with_loops_open([(nodes[name], run) for name, run in first.items()])
+    bound = frozenset(output.name for output in graph.output) | items_given(every)
     memory = [event["args"] for event in events]
     if not all(IN_USE in some for some in memory):
         return Trace(tuple(runs), bound, None, ())
@@ -138,6 +145,34 @@ def read_trace(graph: onnx.GraphProto, events: Sequence[Mapping[str, Any]]) -> T
     before = in_use[0] - int(memory[0][CHANGE])
     most = (max(in_use[i : i + length]) for i in range(0, len(in_use), length))
     return Trace(tuple(runs), bound, before, tuple(most))
+
+
+def with_loops_open(runs: Sequence[tuple[onnx.NodeProto, Run]]) -> list[Run]:
+    """A loop's results in front of its body, and it reads its inputs behind it."""
+    opened: list[Run] = []
+    for node, run in runs:
+        body = {inner.name for graph in bodies(node) for inner in all_nodes(graph)}
+        if body:
+            start = next(i for i, one in enumerate(opened) if one.name in body)
+            opened.insert(start, replace(run, inputs=()))
+            run = replace(run, outputs={})
+        opened.append(run)
+    return opened
+
+
+def items_given(nodes: Sequence[onnx.NodeProto]) -> frozenset[str]:
+    """What the bodies of loops give item by item: it lies in the loops' results."""
+    return frozenset(
+        output.name
+        for node in nodes
+        for body in bodies(node)
+        for output in body.output[len(node.input) - items_read(node) :]
+    )
+
+
+def items_read(loop: onnx.NodeProto) -> int:
+    """How many of a loop's inputs it goes through item by item; the others come before them."""
+    return next(int(one.i) for one in loop.attribute if one.name == "num_scan_inputs")
 
 
 def run_of(node: onnx.NodeProto, event: Mapping[str, Any]) -> Run:

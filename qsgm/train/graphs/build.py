@@ -8,9 +8,12 @@
 
 A value is known by its name, a plain string. Opset and IR version are old enough for every
 runtime since 2022, and the default domain is the only one.
+
+The body of a loop is a graph in another one. It sees that one's inputs, and keeps its constants
+there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -35,8 +38,9 @@ class Operator(Protocol):
 class Graph:
     """Inputs, outputs, constants and nodes, in the order they were added."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, around: "Graph | None" = None) -> None:
         self.name = name
+        self.around = around  # the graph in which this one is the body of a loop
         self.nodes: list[onnx.NodeProto] = []
         self.inputs: list[onnx.ValueInfoProto] = []
         self.outputs: list[onnx.ValueInfoProto] = []
@@ -61,11 +65,15 @@ class Graph:
 
     def initializer(self, name: str, array: NDArray[Any]) -> Value:
         """A constant under a name of its own, its bytes in raw_data."""
+        if self.around is not None:
+            return self.around.initializer(name, array)
         self.constants[name] = numpy_helper.from_array(np.array(array, order="C"), name)
         return name
 
     def constant(self, value: ArrayLike, dtype: DTypeLike = np.float32) -> Value:
         """A constant without a name of its own; equal ones are stored once."""
+        if self.around is not None:
+            return self.around.constant(value, dtype)
         array = np.asarray(value, dtype=dtype)
         key = str(array.dtype), array.shape, array.tobytes()
         if key not in self._shared:
@@ -73,17 +81,17 @@ class Graph:
             self._shared[key] = self.initializer(name, array)
         return self._shared[key]
 
+    def finished(self) -> onnx.GraphProto:
+        """What was added so far."""
+        constants = list(self.constants.values())
+        return helper.make_graph(
+            self._listed_nodes(), self.name, self.inputs, self.outputs, constants
+        )
+
     def model(self) -> onnx.ModelProto:
         """The finished model, checked, with strict shape inference."""
-        graph = helper.make_graph(
-            self._listed_nodes(),
-            self.name,
-            self.inputs,
-            self.outputs,
-            list(self.constants.values()),
-        )
         model = helper.make_model(
-            graph,
+            self.finished(),
             producer_name="qsgm",
             ir_version=IR_VERSION,
             opset_imports=[helper.make_opsetid("", OPSET)],
@@ -105,9 +113,17 @@ class Graph:
             renamed.input[:] = [self.output_names.get(value, value) for value in node.input]
             renamed.output[:] = [self.output_names.get(value, value) for value in node.output]
             nodes.append(renamed)
-        consumed = {value for node in nodes for value in node.input}
-        last = [node for node in nodes if node.output[0] not in consumed]
-        return [node for node in nodes if node.output[0] in consumed] + last[::-1]
+        consumed = {value for node in nodes for value in read_by(node)}
+        last = [node for node in nodes if consumed.isdisjoint(node.output)]
+        return [node for node in nodes if not consumed.isdisjoint(node.output)] + last[::-1]
+
+
+def read_by(node: onnx.NodeProto) -> Iterator[Value]:
+    """Inputs of a node and, of a loop, all that its body reads."""
+    yield from node.input
+    for attribute in node.attribute:
+        for inner in attribute.g.node:
+            yield from read_by(inner)
 
 
 class Ops:
@@ -122,12 +138,46 @@ class Ops:
             raise AttributeError(op_type)
 
         def add(*inputs: Value, **attributes: Any) -> Value:
-            result = f"{self.scope}/{op_type}_{len(self.graph.nodes)}"
+            graph = self.graph
+            scope = self.scope if graph.around is None else f"{self.scope}/{graph.name}"
+            result = f"{scope}/{len(graph.nodes)}"
             node = helper.make_node(op_type, inputs, [result], name=result, **attributes)
-            self.graph.nodes.append(node)
+            graph.nodes.append(node)
             return result
 
         return add
+
+    def one_by_one(
+        self, body: Graph, sums: Sequence[Value], items: Sequence[Value]
+    ) -> tuple[list[Value], list[Value]]:
+        """Run `body` on item after item of the first axis of all `items` (ONNX's Scan).
+
+        Args:
+            body: its inputs are the sums so far, then an item of each; its outputs are the sums
+                after it, then whatever it makes of the items.
+            sums: what they start from.
+            items: of the same length.
+
+        Returns:
+            The sums after the last item, and the other outputs, stacked along a new first axis.
+        """
+        node = helper.make_node(
+            "Scan",
+            [*sums, *items],
+            [f"{self.scope}/{output.name}" for output in body.outputs],
+            name=f"{self.scope}/{body.name}",
+            body=body.finished(),
+            num_scan_inputs=len(items),
+        )
+        self.graph.nodes.append(node)
+        return list(node.output[: len(sums)]), list(node.output[len(sums) :])
+
+    def outside(self) -> "Ops":
+        """The same around all loops."""
+        graph = self.graph
+        while graph.around is not None:
+            graph = graph.around
+        return graph.within(self.scope)
 
     def constant(self, value: ArrayLike, dtype: DTypeLike = np.float32) -> Value:
         """See :meth:`Graph.constant`."""

@@ -5,7 +5,7 @@ A wrong pattern runs all the same, in float and slowly: look before shipping.
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import onnx
@@ -25,7 +25,20 @@ def optimized_nodes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
     with tempfile.TemporaryDirectory() as folder:
         options.optimized_model_filepath = str(Path(folder) / "optimized.onnx")
         ort.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
-        return list(onnx.load(options.optimized_model_filepath).graph.node)
+        return list(all_nodes(onnx.load(options.optimized_model_filepath).graph))
+
+
+def all_nodes(graph: onnx.GraphProto) -> Iterator[onnx.NodeProto]:
+    """A graph's nodes; in front of a loop, those of its body."""
+    for node in graph.node:
+        for body in bodies(node):
+            yield from all_nodes(body)
+        yield node
+
+
+def bodies(node: onnx.NodeProto) -> list[onnx.GraphProto]:
+    """The graph that a loop runs again and again; of other nodes none."""
+    return [one.g for one in node.attribute if one.type == onnx.AttributeProto.GRAPH]
 
 
 def integer_operators(model: onnx.ModelProto) -> list[str]:
@@ -38,7 +51,7 @@ def refuse_float_products(name: str, model: onnx.ModelProto) -> None:
 
     `name` is the graph's, for the message.
     """
-    written = by_layer(products_of_rounded(model.graph.node), PRODUCTS)
+    written = by_layer(products_of_rounded([*all_nodes(model.graph)]), PRODUCTS)
     integer = by_layer(optimized_nodes(model), INTEGER_OPERATORS)
     for layer, expected in sorted(written.items()):
         if integer[layer] != expected:

@@ -20,10 +20,13 @@ from qsgm.blocks import tuned_layers
 from qsgm.train.curvature import Curvature
 from qsgm.train.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
 from qsgm.train.graphs.build import Graph, Ops, Product, Value
-from qsgm.train.graphs.optimizers import Gradient
+from qsgm.train.graphs.optimizers import Gradient, value_of
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
+# Numbers in the windows of one crop, above which a block with an SGM goes crop by crop: what it
+# costs to do so is then little beside the work.
+MANY_NUMBERS = 100_000
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
 
@@ -39,6 +42,7 @@ class TunedLayer:
     side: int  # its input map is side x side
     weight: Value  # (Co, kh * kw * Ci)
     bias: Value  # (Co,)
+    features: DTypeLike | None  # what it reads, if it is the first tuned layer
     steps: FloatArray | None  # (kh * kw * Ci,), where its windows are codes: what one stands for
 
     @property
@@ -69,12 +73,22 @@ class TunedLayer:
         """Of the map behind its pool, which of a crop covers the whole map."""
         return 1 if self.folded.pool > 1 else self.before_side
 
+    @property
+    def many_windows(self) -> bool:
+        """Whether the windows of a batch are too many to be in memory at once."""
+        return self.positions * self.width > MANY_NUMBERS
+
+    @property
+    def into(self) -> int:
+        """Channels of its input."""
+        return int(self.folded.weight.shape[1])
+
 
 @dataclass(frozen=True)
 class Batch:
     """The crops of one step, picked by `rows` from all crops."""
 
-    features: Value  # (B * P, C)
+    features: Value  # (B, P, C), codes or pixels where they are u8
     labels: Value  # (B, 3)
     size: Value  # B, a float32 scalar
 
@@ -86,6 +100,14 @@ class Pass:
     windows: Value  # (B * P, K)
     active: Value  # (B * P, Co), behind ReLU
     after: Value  # (B * P', Co), behind the pool
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Of a layer's parameters."""
+
+    weight: Gradient  # (Co, K)
+    bias: Gradient  # (1, Co)
 
 
 def output_side(side: int, kernel: int, stride: int) -> int:
@@ -103,16 +125,18 @@ def input_side(net: FoldedNet, number: int) -> int:
 
 def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]:
     """The last `tuned` layers, their weights and biases declared as inputs."""
-    layers = []
+    layers, first = [], tuned_layers(tuned)[0]
     for number in tuned_layers(tuned):
         folded = net.layers[number - 1]
         shape = to_step_layout(folded.weight).shape
         weight = graph.input(f"weight{number}", np.float32, shape)
         bias = graph.input(f"bias{number}", np.float32, shape[:1])
-        steps = None
-        if number == tuned_layers(tuned)[0] and number - 1 in net.feature_steps:
-            steps = np.tile(net.feature_steps[number - 1], folded.weight[0, 0].size)
-        layers.append(TunedLayer(number, folded, input_side(net, number), weight, bias, steps))
+        side, features, steps = input_side(net, number), None, None
+        if number == first:
+            features = features_dtype(net, number - 1)
+            if number - 1 in net.feature_steps:
+                steps = np.tile(net.feature_steps[number - 1], folded.weight[0, 0].size)
+        layers.append(TunedLayer(number, folded, side, weight, bias, features, steps))
     return layers
 
 
@@ -128,18 +152,18 @@ def features_dtype(net: FoldedNet, last_frozen: int) -> DTypeLike:
     return np.uint8 if last_frozen == 0 or last_frozen in net.feature_steps else np.float32
 
 
-def as_seen(op: Ops, net: FoldedNet, features: Value, tuned: int) -> Value:
-    """Features (B, P, C) as the first tuned layer sees them, (B * P, C) in float32.
+def as_seen(op: Ops, layer: TunedLayer, x: Value) -> Value:
+    """A layer's input in float32: features (..., P, Ci) if it is the first, else rows as they are.
 
-    Pixels are in [-1, 1]. Codes stay what they are: it is quicker to give their steps to the
+    Pixels are then in [-1, 1]. Codes stay what they are: it is quicker to give their steps to the
     weights, of which there are fewer.
     """
-    number = tuned_layers(tuned)[0]
-    rows = op.Reshape(features, op.shape(-1, net.layers[number - 1].weight.shape[1]))
-    if features_dtype(net, number - 1) != np.uint8:
-        return rows
-    codes = op.Cast(rows, to=TensorProto.FLOAT)
-    return normalized(op, codes) if number == 1 else codes
+    if layer.features is None:
+        return x
+    if layer.features == np.uint8:
+        x = op.Cast(x, to=TensorProto.FLOAT)
+        x = normalized(op, x) if layer.number == 1 else x
+    return op.Reshape(x, op.shape(-1, layer.into)) if layer.kernel == 1 else x
 
 
 def normalized(op: Ops, pixels: Value) -> Value:
@@ -154,8 +178,7 @@ def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
     size = op.Cast(op.Size(rows), to=TensorProto.FLOAT)
-    seen = as_seen(op, net, op.Gather(features, rows, axis=0), tuned)
-    return Batch(seen, op.Gather(labels, rows, axis=0), size)
+    return Batch(op.Gather(features, rows, axis=0), op.Gather(labels, rows, axis=0), size)
 
 
 def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Value:
@@ -169,17 +192,17 @@ def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Va
 
 
 def cut_windows(op: Ops, layer: TunedLayer, x: Value) -> Value:
-    """The windows (B * P, K) that a layer sees of its input (B * P_in, Ci)."""
+    """The windows (B * P, K) that a layer sees of its input (B * P_in, Ci) or (B, P_in, Ci)."""
     if layer.kernel == 1:
         return x
-    maps = op.Reshape(x, op.shape(-1, layer.side**2, layer.folded.weight.shape[1]))
+    maps = op.Reshape(x, op.shape(-1, layer.side**2, layer.into))
     windows = gather_windows(op, maps, layer.side, layer.kernel, layer.folded.stride)
     return op.Reshape(windows, op.shape(-1, layer.width))
 
 
 def forward(op: Ops, layer: TunedLayer, x: Value) -> Pass:
-    """Input (B * P_in, Ci) through convolution, ReLU and pool."""
-    seen, weight = cut_windows(op, layer, x), layer.weight
+    """Input (B * P_in, Ci), or features, through convolution, ReLU and pool."""
+    seen, weight = cut_windows(op, layer, as_seen(op, layer, x)), layer.weight
     if layer.steps is not None:
         weight = op.Mul(weight, op.constant(layer.steps))
     active = op.Gemm(seen, weight, layer.bias, transB=1)
@@ -220,38 +243,41 @@ def is_positive(op: Ops, x: Value) -> Value:
     return op.HardSigmoid(x, alpha=STEEP, beta=0.0)
 
 
-def weight_gradients(
-    op: Ops, layer: TunedLayer, done: Pass, dz: Value
-) -> tuple[Gradient, Gradient]:
-    """Gradients of weight (Co, K) and bias (1, Co), summed over all rows of dz (B * P, C)."""
-    d_weight = Product(dz, done.windows, turned=True)
-    d_bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
+def summed_gradients(op: Ops, done: Pass, dz: Value) -> Gradients:
+    """What the windows, as they are, and all rows of dz (B * P, C) come to."""
+    bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
+    return Gradients(Product(dz, done.windows, turned=True), bias)
+
+
+def weight_gradients(op: Ops, layer: TunedLayer, summed: Gradients) -> Gradients:
+    """The same where windows are codes, of which a step stands for something."""
     if layer.steps is None:
-        return d_weight, d_bias
-    return op.Mul(d_weight.alone(op), op.constant(layer.steps)), d_bias
+        return summed
+    weight = op.Mul(value_of(op, summed.weight), op.constant(layer.steps))
+    return Gradients(weight, summed.bias)
 
 
 def bent_gradients(
-    op: Ops, layer: TunedLayer, done: Pass, dz: Value, curvature: Curvature
-) -> tuple[Gradient, Gradient]:
+    op: Ops, layer: TunedLayer, summed: Gradients, curvature: Curvature
+) -> Gradients:
     """:func:`weight_gradients` along the layer's curvature, as `Curvature.bend` has them."""
     window, into, out, bias = (matrix.numpy() for matrix in curvature.matrices)
     if layer.steps is not None:  # where they cost no node
         into = layer.steps[: len(into), None] * into
-    d_weight = Product(dz, done.windows, turned=True).alone(op)
+    d_weight = value_of(op, summed.weight)
     if layer.kernel == 1:  # one position: its factor goes with another matrix
         windows = op.MatMul(d_weight, op.constant(window[0, 0] * into))
     else:
         maps = op.Reshape(d_weight, op.shape(layer.channels, len(window), len(into)))
         windows = op.MatMul(op.constant(window.T), op.MatMul(maps, op.constant(into)))
         windows = op.Reshape(windows, op.shape(layer.channels, layer.width))
-    d_bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
-    return Product(op.constant(out.T), windows), Product(d_bias, op.constant(bias))
+    d_bias = value_of(op, summed.bias)
+    return Gradients(Product(op.constant(out.T), windows), Product(d_bias, op.constant(bias)))
 
 
 def gradient_before(op: Ops, layer: TunedLayer, dz: Value) -> Value:
     """dz (B * P, C) carried back to the layer's input: (B * P_in, Ci)."""
-    into, kernel, side = layer.folded.weight.shape[1], layer.kernel, layer.side
+    into, kernel, side = layer.into, layer.kernel, layer.side
     if kernel == 1:
         return op.Gemm(dz, layer.weight)
     weight = op.Reshape(layer.weight, op.shape(-1, kernel, kernel, into))

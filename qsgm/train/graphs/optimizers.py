@@ -45,7 +45,7 @@ class Sgd:
         def update(
             op: Ops, value: Value, moments: Sequence[Value], gradient: Gradient, rate: Value
         ) -> tuple[Value, Sequence[Value]]:
-            momentum = _plus(op, gradient, moments[0], self.momentum)
+            momentum = plus(op, gradient, moments[0], self.momentum)
             return op.Sub(value, op.Mul(rate, momentum)), (momentum,)
 
         return update
@@ -93,11 +93,11 @@ def value_of(op: Ops, gradient: Gradient) -> Value:
     return gradient.alone(op) if isinstance(gradient, Product) else gradient
 
 
-def _plus(op: Ops, gradient: Gradient, moment: Value, decay: float) -> Value:
-    """The gradient plus the moment times `decay`."""
+def plus(op: Ops, gradient: Gradient, other: Value, factor: float) -> Value:
+    """The gradient plus `factor` times a value of its shape."""
     if isinstance(gradient, Product):
-        return gradient.plus(op, moment, decay)
-    return op.Add(op.Mul(moment, op.constant(decay)), gradient)
+        return gradient.plus(op, other, factor)
+    return op.Add(other if factor == 1 else op.Mul(other, op.constant(factor)), gradient)
 
 
 def _decayed(op: Ops, moment: Value, new: Value, decay: float) -> Value:

@@ -16,11 +16,11 @@ from qsgm.train.graphs.layers import (
     Batch,
     Pass,
     TunedLayer,
-    as_seen,
     declare_batch,
     declare_features,
     declare_layers,
     gradient_before,
+    summed_gradients,
     through_activation,
     weight_gradients,
 )
@@ -78,9 +78,8 @@ def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProt
     """`features` (N, P, C) and the tuned layers to `outputs` (N, 3): quality, sine, cosine."""
     graph = Graph("head")
     layers = declare_layers(graph, net, tuned)
+    passes = forward_all(graph, layers, declare_features(graph, net, tuned))
     op = graph.within("head")
-    features = as_seen(op, net, declare_features(graph, net, tuned), tuned)
-    passes = forward_all(graph, layers, features)
     activated = activate(op, passes[-1].after, encoding)
     graph.output("outputs", op.Concat(*activated, axis=1), np.float32, ("crops", 3))
     return graph.model()
@@ -112,7 +111,7 @@ def probe_sgm(
     """Declare `activation{k}`, `float{k}`, `int8{k}`, `clipped{k}` of a layer; both gradients."""
     number, side = layer.number, layer.after_side
     op = graph.within(f"layer{number}/float")
-    seen = sgm_inputs(op, done.after, side, batch)
+    seen = sgm_inputs(op, done.after, side, batch.labels)
     report_maps(op, f"activation{number}", done.after, layer)
     floating = float_sgm(op, float_one, side, seen)
     report_maps(op, f"float{number}", floating, layer)
@@ -140,7 +139,8 @@ def probe_updates(
     for name, gradient in gradients.items():
         op = graph.within(f"layer{layer.number}/update_{name}")
         dz = through_activation(op, layer, done, gradient)
-        d_weight, d_bias = (value_of(op, one) for one in weight_gradients(op, layer, done, dz))
+        found = weight_gradients(op, layer, summed_gradients(op, done, dz))
+        d_weight, d_bias = value_of(op, found.weight), value_of(op, found.bias)
         update = op.Concat(d_weight, op.Transpose(d_bias, perm=(1, 0)), axis=1)
         shape = layer.channels, layer.width + 1
         graph.output(f"update_{name}{layer.number}", update, np.float32, shape)

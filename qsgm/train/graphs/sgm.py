@@ -11,30 +11,30 @@ import numpy as np
 from qsgm.folded import FoldedSgm
 from qsgm.quantize import (
     LABELS,
+    PLANE_STEPS,
+    U8_ZERO,
     UNDERFLOW_STEPS,
-    Codes,
     QuantizedProduct,
     QuantizedSgm,
     clipping_bounds,
     constants,
 )
 from qsgm.train.graphs.build import Ops, Value
-from qsgm.train.graphs.layers import Batch, at_every_position, gather_windows
+from qsgm.train.graphs.layers import at_every_position, gather_windows
 
 
 def sgm_gradient(
-    op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, batch: Batch
+    op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, labels: Value
 ) -> Value:
-    """The gradient (B * P, C) that the SGM gives for an activation of as many, P = side * side."""
-    seen = sgm_inputs(op, after, side, batch)
+    """The gradient (B * P, C) for an activation of as many, P = side * side, and labels (B, 3)."""
+    seen = sgm_inputs(op, after, side, labels)
     if isinstance(sgm, QuantizedSgm):
         return int8_sgm(op, sgm, side, seen)
     return float_sgm(op, sgm, side, seen)
 
 
-def sgm_inputs(op: Ops, after: Value, side: int, batch: Batch) -> Value:
+def sgm_inputs(op: Ops, after: Value, side: int, labels: Value) -> Value:
     """Activation (B * P, C) and label, the same at every position: side by side, (B * P, Ci)."""
-    labels = batch.labels
     if side > 1:
         labels = at_every_position(op, labels, side**2, LABELS)
     return op.Concat(after, labels, axis=1)
@@ -64,7 +64,7 @@ def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
     """
     declare_constants(op, sgm)
     x = scaled_inputs(op, sgm, padded(op, seen, side, sgm.kernel, len(sgm.input_low)))
-    planes = as_planes(op, sgm.codes, x)
+    planes = as_planes(op, sgm, x)
     for i, product in enumerate(sgm.products):
         if i > 0:
             planes = framed_planes(op, sgm, side, x, len(sgm.products[i - 1].bias))
@@ -74,7 +74,7 @@ def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
             u8_windows(op, u8, side, sgm.kernel, width)
             for u8, width in zip(planes, widths, strict=True)
         )
-        x = int8_product(op, f"sgm{sgm.layer}/{i}", product, high, both)
+        x = int8_product(op, f"sgm{sgm.layer}/{i}", product, sgm, high, both)
     return x
 
 
@@ -103,16 +103,14 @@ def scaled_inputs(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
     return op.Mul(op.Sub(seen, low), gain)
 
 
-def as_planes(op: Ops, codes: Codes, x: Value) -> tuple[Value, Value]:
+def as_planes(op: Ops, sgm: QuantizedSgm, x: Value) -> tuple[Value, Value]:
     """Shifted codes (..., C) to their high plane u8 (..., C), and to all planes side by side."""
-    nothing = op.constant(0, np.uint8)
-    if codes.high_step == 1:
-        high = op.QuantizeLinear(x, op.constant(1.0), nothing)
-        return high, high
-    step = op.constant(float(codes.high_step))
+    step, nothing = op.constant(float(sgm.codes.high_step)), op.constant(0, np.uint8)
     high = op.QuantizeLinear(x, step, nothing)
+    if sgm.bits == 8:
+        return high, high
     remainder = op.Sub(x, op.DequantizeLinear(high, step, nothing))
-    low = op.QuantizeLinear(remainder, op.constant(1.0), op.constant(codes.shift, np.uint8))
+    low = op.QuantizeLinear(remainder, f"sgm{sgm.layer}/low_step", f"sgm{sgm.layer}/low_zero")
     return high, op.Concat(high, low, axis=-1)
 
 
@@ -120,7 +118,7 @@ def framed_planes(
     op: Ops, sgm: QuantizedSgm, side: int, hidden: Value, channels: int
 ) -> tuple[Value, Value]:
     """The planes of hidden maps (B * P, C), with the code 0 around them where they are maps."""
-    high, both = as_planes(op, sgm.codes, hidden)
+    high, both = as_planes(op, sgm, hidden)
     return (
         padded(op, high, side, sgm.kernel, channels),
         padded(op, both, side, sgm.kernel, channels * sgm.bits // 8),
@@ -135,27 +133,39 @@ def u8_windows(op: Ops, x: Value, side: int, kernel: int, width: int) -> Value:
     return op.DequantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
 
 
-def int8_product(op: Ops, name: str, product: QuantizedProduct, high: Value, both: Value) -> Value:
+def int8_product(
+    op: Ops, name: str, product: QuantizedProduct, sgm: QuantizedSgm, high: Value, both: Value
+) -> Value:
     """Windows of the high plane and of all planes to (B * P, O).
 
     `name` is what the product's constants begin with. The bias has the scale of what it is added
     to, exactly: that input's scale is 1.
     """
+    fine, coarse = weight_planes(op, name, product, sgm.kernel**2)
+    # What the runtime folds has to be where it finds constants: outside of any loop.
+    outside = op.outside()
+    coarse_scale = outside.Mul(f"{name}/scale", op.constant(float(PLANE_STEPS)))
     bias = op.DequantizeLinear(f"{name}/bias", f"{name}/scale", axis=0)
-    coarse = op.Gemm(high, s8_weight(op, name, "coarse", "coarse_scale", product), transB=1)
-    rest = op.Gemm(both, s8_weight(op, name, "rest", "scale", product), bias, transB=1)
-    return op.Add(coarse, rest)
+    first = op.Gemm(high, s8_weight(op, coarse, coarse_scale, product), transB=1)
+    rest = f"{name}/weight" if sgm.bits == 16 else fine
+    second = op.Gemm(both, s8_weight(op, rest, f"{name}/scale", product), bias, transB=1)
+    return op.Add(first, second)
 
 
-def s8_weight(op: Ops, name: str, weight: str, scale: str, product: QuantizedProduct) -> Value:
-    """Weights with a scale per row, as the runtime wants to see them.
+def weight_planes(op: Ops, name: str, product: QuantizedProduct, taps: int) -> tuple[Value, Value]:
+    """The fine and the coarse plane (O, I) of a product's weights: slices, folded on loading."""
+    outside, (rows, width) = op.outside(), product.fine.shape
+    channels = width // taps
+    weight = outside.Reshape(f"{name}/weight", op.shape(rows, taps, 2, channels))
+    halves = (outside.Slice(weight, op.shape(i), op.shape(i + 1), op.shape(2)) for i in range(2))
+    fine, coarse = (outside.Reshape(half, op.shape(rows, width)) for half in halves)
+    return fine, coarse
 
-    Neither weights nor zero points are shared, equal or not: where the runtime makes them u8 (see
-    :mod:`qsgm.runtime`) it refuses to convert the same constant twice.
-    """
-    no_offset = np.zeros(len(product.bias), np.int8)
-    zero_point = op.graph.initializer(f"{name}/{weight}_zero_point", no_offset)
-    return op.DequantizeLinear(f"{name}/{weight}", f"{name}/{scale}", zero_point, axis=0)
+
+def s8_weight(op: Ops, weight: Value, scale: Value, product: QuantizedProduct) -> Value:
+    """s8 weights, held as u8 around a zero point, with a scale per row."""
+    zero_point = op.constant(np.full(len(product.bias), U8_ZERO), np.uint8)
+    return op.DequantizeLinear(weight, scale, zero_point, axis=0)
 
 
 def clipped_fraction(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:

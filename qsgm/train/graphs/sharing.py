@@ -1,15 +1,18 @@
-"""Constants that many graphs hold, once: ONNX external data in one file beside the graphs.
+"""Constants that many graphs hold, once: ONNX external data in a file beside the graphs.
 
 Any ONNX runtime finds them there when it opens a graph by its path.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from onnx import ModelProto
 from onnx.external_data_helper import set_external_data
+
+from qsgm.train.graphs.trunk import initializer_offsets
 
 # Smaller constants stay in the graph: naming the place of another takes as many bytes.
 LEAST_BYTES = 200
@@ -19,11 +22,33 @@ ALIGNMENT = 64
 EXCHANGED = "sgm"
 
 
+@dataclass(frozen=True)
+class OtherFile:
+    """A file that holds some constants anyway."""
+
+    location: str
+    data: bytes
+    places: Mapping[str, tuple[int, int]]  # offset and bytes of each
+
+    def offset_of(self, raw: bytes) -> int | None:
+        """Where these bytes lie in the file, as a constant of their own."""
+        for offset, length in self.places.values():
+            if self.data[offset : offset + length] == raw:
+                return offset
+        return None
+
+
+def constants_elsewhere(location: str, model: bytes) -> OtherFile:
+    """The constants in another model's file."""
+    return OtherFile(location, model, initializer_offsets(model))
+
+
 class SharedConstants:
     """Bytes that are written once however often they are asked for."""
 
-    def __init__(self, location: str) -> None:
+    def __init__(self, location: str, other: OtherFile | None = None) -> None:
         self.location = location
+        self._other = other
         self._data = bytearray()
         self._offsets: dict[bytes, int] = {}
 
@@ -50,6 +75,13 @@ class SharedConstants:
         for model in models:
             for tensor in model.graph.initializer:
                 if len(tensor.raw_data) >= LEAST_BYTES or tensor.name.startswith(EXCHANGED):
-                    offset, length = self.add(tensor.raw_data), len(tensor.raw_data)
-                    set_external_data(tensor, self.location, offset, length)
+                    location, offset = self.place_of(tensor.raw_data)
+                    set_external_data(tensor, location, offset, len(tensor.raw_data))
                     tensor.ClearField("raw_data")
+
+    def place_of(self, raw: bytes) -> tuple[str, int]:
+        """File and offset: the other file's where that holds them, else this one's."""
+        offset = None if self._other is None else self._other.offset_of(raw)
+        if self._other is None or offset is None:
+            return self.location, self.add(raw)
+        return self._other.location, offset

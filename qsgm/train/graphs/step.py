@@ -15,12 +15,13 @@ from onnx import ModelProto
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
 from qsgm.folded import FoldedSgm
-from qsgm.quantize import QuantizedSgm
+from qsgm.quantize import LABELS, QuantizedSgm
 from qsgm.train.curvature import FLAT, Curvature
 from qsgm.train.fold import FoldedNet
-from qsgm.train.graphs.build import Graph, Ops, Value
+from qsgm.train.graphs.build import Graph, Value
 from qsgm.train.graphs.layers import (
     Batch,
+    Gradients,
     Pass,
     TunedLayer,
     bent_gradients,
@@ -28,11 +29,12 @@ from qsgm.train.graphs.layers import (
     declare_layers,
     forward,
     gradient_before,
+    summed_gradients,
     through_activation,
     weight_gradients,
 )
 from qsgm.train.graphs.loss import loss_and_error
-from qsgm.train.graphs.optimizers import Gradient, Optimizer, Rule
+from qsgm.train.graphs.optimizers import Gradient, Optimizer, Rule, plus
 from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graspnet import Loss
 
@@ -68,15 +70,14 @@ def step_model(
     x = batch.features
     for group in blocks.groups:
         block = [layers[number] for number in group]
-        passes = forward_all(graph, block, x)
-        op, x = graph.within(f"layer{group[-1]}"), passes[-1].after
-        if group[-1] in used:
-            gradient = sgm_gradient(op, used[group[-1]], block[-1].after_side, x, batch)
+        if group[-1] not in used:
+            gradients, x = last_block(graph, block, loss, x, batch)
+        elif any(layer.many_windows for layer in block):
+            gradients, x = block_by_crops(graph, block, used[group[-1]], x, batch)
         else:
-            gradient = report_loss(op, loss, x, batch)
-        # Divided by the batch here, where the gradient is smallest: the rest is sums.
-        shared = op.Div(gradient, batch.size)
-        update_block(graph, block, passes, shared, curvatures, optimizer, rule)
+            gradients, x = whole_block(graph, block, used[group[-1]], x, batch)
+        for layer, summed in list(zip(block, gradients, strict=True))[::-1]:
+            update_layer(graph, layer, summed, curvatures, optimizer, rule)
     return graph.model()
 
 
@@ -99,47 +100,123 @@ def forward_all(graph: Graph, layers: list[TunedLayer], x: Value) -> list[Pass]:
     return passes
 
 
-def report_loss(op: Ops, loss: Loss, raw: Value, batch: Batch) -> Value:
-    """Declare the output `loss`; return each sample's error, d loss / d raw outputs (B, 3)."""
-    mean, error = loss_and_error(op, loss, raw, batch.labels)
-    op.graph.output("loss", mean, np.float32, ())
-    return error
+def last_block(
+    graph: Graph, block: list[TunedLayer], loss: Loss, x: Value, batch: Batch
+) -> tuple[list[Gradients], Value]:
+    """Gradients from the loss, which is declared as an output; and the raw outputs (B, 3)."""
+    op = graph.within(f"layer{block[-1].number}")
+    passes = forward_all(graph, block, x)
+    mean, error = loss_and_error(op, loss, passes[-1].after, batch.labels)
+    graph.output("loss", mean, np.float32, ())
+    return carried_back(graph, block, passes, op.Div(error, batch.size)), passes[-1].after
 
 
-def update_block(
+def whole_block(
+    graph: Graph, block: list[TunedLayer], sgm: AnySgm, x: Value, batch: Batch
+) -> tuple[list[Gradients], Value]:
+    """Gradients from the SGM behind a block; and what the block gives, (B * P', C)."""
+    op, last = graph.within(f"layer{block[-1].number}"), block[-1]
+    passes = forward_all(graph, block, x)
+    gradient = sgm_gradient(op, sgm, last.after_side, passes[-1].after, batch.labels)
+    # Divided by the batch here, where the gradient is smallest: the rest is sums.
+    return carried_back(graph, block, passes, op.Div(gradient, batch.size)), passes[-1].after
+
+
+def block_by_crops(
+    graph: Graph, block: list[TunedLayer], sgm: AnySgm, x: Value, batch: Batch
+) -> tuple[list[Gradients], Value]:
+    """The same with one crop's windows in memory at a time.
+
+    With an SGM behind it a block asks nothing of the layers behind, and its gradients are sums over
+    crops: what has to be there for all of them is no more than what it reads and gives.
+    Backpropagation comes back to every crop's windows.
+    """
+    first, last = block[0], block[-1]
+    body = Graph("crop", graph)
+    sums = [declare_sums(body, layer) for layer in block]
+    maps = first.side**2, first.into
+    crop = body.input(f"input{first.number}", first.features or np.float32, maps)
+    label = body.input(f"label{first.number}", np.float32, (LABELS,))
+    add_crop(body, block, sgm, sums, crop, label)
+    op = graph.within(f"layer{last.number}")
+    nothing = [
+        op.ConstantOfShape(op.shape(*shape)) for layer in block for shape in gradient_shapes(layer)
+    ]
+    crops = op.Reshape(x, op.shape(-1, *maps)) if first.features is None else x
+    found, (after,) = op.one_by_one(body, nothing, [crops, batch.labels])
+    means = [op.Div(total, batch.size) for total in found]
+    gradients = [Gradients(*pair) for pair in zip(means[::2], means[1::2], strict=True)]
+    return gradients, op.Reshape(after, op.shape(-1, last.channels))
+
+
+def gradient_shapes(layer: TunedLayer) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Of a layer's weight and bias."""
+    return (layer.channels, layer.width), (1, layer.channels)
+
+
+def declare_sums(body: Graph, layer: TunedLayer) -> tuple[Value, Value]:
+    """Sums of a layer's gradients over the crops before this one."""
+    weight, bias = gradient_shapes(layer)
+    return (
+        body.input(f"weight_sum{layer.number}", np.float32, weight),
+        body.input(f"bias_sum{layer.number}", np.float32, bias),
+    )
+
+
+def add_crop(
+    body: Graph,
+    block: list[TunedLayer],
+    sgm: AnySgm,
+    sums: list[tuple[Value, Value]],
+    crop: Value,  # (P, Ci)
+    label: Value,  # (3,)
+) -> None:
+    """Declare the sums with this crop's gradients, and what the block gives for it, (P', C)."""
+    last = block[-1]
+    op = body.within(f"layer{last.number}")
+    passes = forward_all(body, block, crop)
+    labels = op.Reshape(label, op.shape(1, LABELS))
+    gradient = sgm_gradient(op, sgm, last.after_side, passes[-1].after, labels)
+    found = carried_back(body, block, passes, gradient)
+    for layer, so_far, one in zip(block, sums, found, strict=True):
+        totals = plus(op, one.weight, so_far[0], 1.0), plus(op, one.bias, so_far[1], 1.0)
+        for name, total, shape in zip(so_far, totals, gradient_shapes(layer), strict=True):
+            body.output(f"{name}_next", total, np.float32, shape)
+    shape = last.after_side**2, last.channels
+    body.output(f"after{last.number}", passes[-1].after, np.float32, shape)
+
+
+def carried_back(
+    graph: Graph, block: list[TunedLayer], passes: list[Pass], gradient: Value
+) -> list[Gradients]:
+    """All these layers' gradients, from the one (B * P', C) on the last one's activation.
+
+    It is carried back with the weights as they were.
+    """
+    found = []
+    for layer, done in list(zip(block, passes, strict=True))[::-1]:
+        op = graph.within(f"layer{layer.number}")
+        dz = through_activation(op, layer, done, gradient)
+        found.append(summed_gradients(op, done, dz))
+        if layer is not block[0]:
+            gradient = gradient_before(op, layer, dz)
+    return found[::-1]
+
+
+def update_layer(
     graph: Graph,
-    layers: list[TunedLayer],
-    passes: list[Pass],
-    gradient: Value,
+    layer: TunedLayer,
+    summed: Gradients,
     curvatures: Mapping[int, Curvature],
     optimizer: Optimizer,
     rule: Rule,
 ) -> None:
-    """All these layers' updates, from the gradient (B * P', C) on the last one's activation.
-
-    It is carried back with the weights as they were.
-    """
-    for layer, done in list(zip(layers, passes, strict=True))[::-1]:
-        op = graph.within(f"layer{layer.number}")
-        dz = through_activation(op, layer, done, gradient)
-        if layer.number in curvatures:
-            gradients = bent_gradients(op, layer, done, dz, curvatures[layer.number])
-        else:
-            gradients = weight_gradients(op, layer, done, dz)
-        update_layer(op, layer, *gradients, optimizer, rule)
-        if layer is not layers[0]:
-            gradient = gradient_before(op, layer, dz)
-
-
-def update_layer(
-    op: Ops,
-    layer: TunedLayer,
-    d_weight: Gradient,
-    d_bias: Gradient,
-    optimizer: Optimizer,
-    rule: Rule,
-) -> None:
-    """One layer's update from the gradients (Co, K) and (1, Co) of its weight and bias."""
+    """One layer's update."""
+    op = graph.within(f"layer{layer.number}")
+    if layer.number in curvatures:
+        gradients = bent_gradients(op, layer, summed, curvatures[layer.number])
+    else:
+        gradients = weight_gradients(op, layer, summed)
     rate = op.graph.input(f"rate{layer.number}", np.float32, ())
 
     def update(value: Value, kind: str, gradient: Gradient, shape: tuple[int, int]) -> Value:
@@ -150,7 +227,7 @@ def update_layer(
             op.graph.output(f"{name}_next", result, np.float32, shape)
         return next_value
 
-    weight = update(layer.weight, "weight", d_weight, (layer.channels, layer.width))
+    weight = update(layer.weight, "weight", gradients.weight, (layer.channels, layer.width))
     op.graph.output(f"{layer.weight}_next", weight, np.float32, (layer.channels, layer.width))
-    bias = op.Squeeze(update(layer.bias, "bias", d_bias, (1, layer.channels)), op.shape(0))
+    bias = op.Squeeze(update(layer.bias, "bias", gradients.bias, (1, layer.channels)), op.shape(0))
     op.graph.output(f"{layer.bias}_next", bias, np.float32, (layer.channels,))
