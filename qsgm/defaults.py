@@ -1,8 +1,12 @@
 """Numbers that the command line shows before anything heavy is imported."""
 
+import os
+
 EPOCHS = 20
 SHORT_RUNS = "1,3"  # epochs, of `bench accuracy`
 LAYERS = 3  # tuned
+SLIM_BLOCKS = "4,5,6"  # those, each on its own
 MOST_LAYERS = 6  # that can be tuned
 PROBE_EVERY = 25  # steps: once per epoch
 CALIBRATION_FRAMES = 24
+THREAD_COUNTS = "1,2" if (os.cpu_count() or 1) > 1 else "1"  # of single steps, in `bench speed`

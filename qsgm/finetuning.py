@@ -35,7 +35,14 @@ from qsgm.preparing import (
 )
 from qsgm.probing import NOTHING_EXCHANGED, Exchanged, Probe, Prober, constants_of, recalibrate
 from qsgm.report import run_json
-from qsgm.settings import Settings, run_blocks, sgm_blocks, trunk_precision
+from qsgm.runtime import run_options
+from qsgm.settings import (
+    Settings,
+    run_blocks,
+    sgm_blocks,
+    takes_much_memory,
+    trunk_precision,
+)
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.tuning import BATCH, StepLoop, tune
 from qsgm.weights import to_conv_layout
@@ -62,7 +69,8 @@ class FinetuneResult:
     accuracy: Accuracy
     losses: tuple[float, ...]  # mean over each epoch
     probes: tuple[Probe, ...]
-    seconds: dict[str, float]  # crops, features, tuning, probes, total
+    # crops, features, tuning, probes, total; what is streamed counts where it is asked for
+    seconds: dict[str, float]
     warnings: tuple[str, ...] = field(default=())
     # by step (0: before the first), in the step graphs' layout
     kept: Mapping[int, dict[str, Array]] = field(default_factory=dict)
@@ -251,19 +259,26 @@ class _GuardedLoop(StepLoop):
         name = step_file(settings.precision, recipe.optimizer, blocks)
         int8_layers = blocks.sgm_layers if settings.precision == "int8" else ()
         session = bundle.session(name, settings.threads, constants_of(exchanged, int8_layers))
+        # A probe takes as much as a step: neither keeps its memory while the other runs.
+        self._before_probe = run_options(give_memory_back=takes_much_memory(settings))
         steps = settings.epochs * STEPS_PER_EPOCH
         rates = dict(zip(blocks.layers, recipe.rates_over(steps), strict=True))
         self.steps = 0
-        self._bundle = bundle
+        self._bundle, self._batch = bundle, prepared.batch
+        features, labels, _ = prepared.batch(np.arange(0))
         with running_graphs(bundle):
-            super().__init__(session, prepared.features, prepared.labels, prepared.start, rates)
+            super().__init__(session, features, labels, prepared.start, rates)
         self._keep, self._prober = keep, prober
         self.kept: dict[int, dict[str, Array]] = {}
         self._look()
 
     def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
+        features, labels, among = self._batch(rows)
         with running_graphs(self._bundle):
-            loss = super().step(rows, factor)
+            self.put(features, labels)
+            before_probe = self._prober.wants(self.steps + 1)
+            self._options = self._before_probe if before_probe else None
+            loss = super().step(among, factor)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
         self._look()

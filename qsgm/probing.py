@@ -5,7 +5,7 @@ calibrated on anew.
 """
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -21,7 +21,8 @@ from qsgm.errors import QsgmError
 from qsgm.fidelity import PROBED, LayerFidelity, compare_probe
 from qsgm.preparing import STEPS_PER_EPOCH, Array, Prepared, running_graphs
 from qsgm.recalibration import recalibrated
-from qsgm.settings import Settings, run_blocks, sgm_blocks
+from qsgm.runtime import run_options
+from qsgm.settings import Settings, run_blocks, sgm_blocks, takes_much_memory
 from qsgm.tuning import BATCH
 
 # Constants of int8 SGMs: by layer, by initializer name.
@@ -30,6 +31,8 @@ NOTHING_EXCHANGED: Exchanged = MappingProxyType({})
 # Crops whose activations an int8 SGM is calibrated on anew, and how many at a time; of maps, whose
 # crops have thousands of positions, the first slice has to do.
 RECALIBRATION_CROPS, RECALIBRATION_SLICE = 400, 16
+# Crops that a probe looks at together, where activations take much memory.
+PROBE_SLICE = 8
 
 
 @dataclass(frozen=True)
@@ -98,11 +101,19 @@ def activations_of(
 ) -> dict[int, Array]:
     """What the layers in front of SGMs give on the crops `rows` with these weights, (B, P, C)."""
     layers = sgm_blocks(settings).sgm_layers
-    feeds = {"features": prepared.features, "labels": prepared.labels, "rows": rows, **weights}
+    feeds = feeds_of(prepared, weights, rows)
     names = [f"activation{layer}" for layer in layers]
     with running_graphs(prepared.bundle):
-        values = session.run(names, feeds, only_what_is_asked())
+        values = session.run(names, feeds, run_options(whole_graph=False))
     return dict(zip(layers, values, strict=True))
+
+
+def feeds_of(
+    prepared: Prepared, weights: Mapping[str, Array], rows: NDArray[np.int64]
+) -> dict[str, NDArray[Any]]:
+    """What the probe graph takes to look at the crops `rows`."""
+    features, labels, among = prepared.batch(rows)
+    return {"features": features, "labels": labels, "rows": among, **weights}
 
 
 def constants_of(exchanged: Exchanged, layers: Collection[int]) -> dict[str, NDArray[Any]]:
@@ -110,11 +121,20 @@ def constants_of(exchanged: Exchanged, layers: Collection[int]) -> dict[str, NDA
     return {name: array for layer in layers for name, array in exchanged.get(layer, {}).items()}
 
 
-def only_what_is_asked() -> ort.RunOptions:
-    """Nothing is computed that the outputs asked for do not need."""
-    options = ort.RunOptions()
-    options.only_execute_path_to_fetches = True
-    return options
+def whole_batch(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Outputs of the probe graph for a batch, from those for equal parts of it.
+
+    Gradients of samples lie one after the other, those of updates are sums over samples, and what
+    has no axis is a share, of which this is the mean.
+    """
+
+    def joined(name: str) -> Array:
+        found = [part[name] for part in parts]
+        if name.startswith("update"):
+            return np.asarray(np.sum(found, axis=0))
+        return np.concatenate(found) if found[0].ndim else np.asarray(np.mean(found, axis=0))
+
+    return dict(parts[0]) if len(parts) == 1 else {name: joined(name) for name in parts[0]}
 
 
 class Prober:
@@ -132,27 +152,34 @@ class Prober:
         self._every = settings.probe_every
         self._rng = np.random.default_rng([settings.seed, 2])
         self._session = None
-        self._bundle = prepared.bundle
+        much = takes_much_memory(settings)
+        self._at_once = PROBE_SLICE if much else BATCH
+        self._options = run_options(whole_graph=False, give_memory_back=much)
+        self._prepared, self._bundle = prepared, prepared.bundle
         name = probe_file(settings.layers)
         if wanted and self._layers and name in prepared.bundle.manifest["files"]:
             self._session = open_probe(prepared, settings, exchanged)
             self._refuse_unless_complete(name, self._session)
-        self._data = {"features": prepared.features, "labels": prepared.labels}
         self.seconds = time.perf_counter() - began
 
     def wants(self, step: int) -> bool:
         return self._session is not None and step % self._every == 0
 
     def __call__(self, step: int, weights: Mapping[str, Array]) -> None:
-        assert self._session is not None, "nobody wants to probe"
         began = time.perf_counter()
         rows = self._rng.choice(TRAIN_CROPS, BATCH, replace=False)
-        feeds = {**self._data, "rows": rows, **weights}
-        with running_graphs(self._bundle):
-            values = self._session.run(self._names, feeds, only_what_is_asked())
-        outputs = dict(zip(self._names, values, strict=True))
-        self.probes.append(Probe(step, compare_probe(outputs, self._layers)))
+        pieces = np.split(rows, len(rows) // self._at_once)
+        parts = [self._outputs(some, weights) for some in pieces]
+        self.probes.append(Probe(step, compare_probe(whole_batch(parts), self._layers)))
         self.seconds += time.perf_counter() - began
+
+    def _outputs(self, rows: NDArray[np.int64], weights: Mapping[str, Array]) -> dict[str, Array]:
+        """What the probe graph gives for some crops, by name."""
+        assert self._session is not None, "nobody wants to probe"
+        feeds = feeds_of(self._prepared, weights, rows)
+        with running_graphs(self._bundle):
+            values = self._session.run(self._names, feeds, self._options)
+        return dict(zip(self._names, values, strict=True))
 
     def _refuse_unless_complete(self, name: str, session: ort.InferenceSession) -> None:
         there = {output.name for output in session.get_outputs()}

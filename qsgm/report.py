@@ -87,6 +87,7 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "peak_activation_bytes": result.peak_activation_bytes,
         "blocks": str(result.blocks),
         "recalibrated": settings.recalibrate,
+        "stream": result.prepared.settings.stream,
         "trunk": result.trunk,
         "optimizer": result.recipe.optimizer,
         "rates": list(result.recipe.rates_over(result.steps)),

@@ -46,6 +46,20 @@ def session_options(threads: int = 1) -> ort.SessionOptions:
     return options
 
 
+def run_options(*, whole_graph: bool = True, give_memory_back: bool = False) -> ort.RunOptions:
+    """How one run differs from others.
+
+    Args:
+        whole_graph: if not, nothing is computed that the outputs asked for do not need.
+        give_memory_back: when it is done; the session's next run has to ask for it again.
+    """
+    options = ort.RunOptions()
+    options.only_execute_path_to_fetches = not whole_graph
+    if give_memory_back:
+        options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+    return options
+
+
 def open_session(
     model: Path | bytes, threads: int = 1, constants: Mapping[str, NDArray[Any]] = _NONE
 ) -> ort.InferenceSession:

@@ -20,10 +20,20 @@ class Settings:
     optimizer: OptimizerName | None = None
     epochs: int = defaults.EPOCHS
     recalibrate: bool = False  # the int8 SGMs, on this object's crops before the first step
+    stream: bool = False  # make crops and features again for every batch, keep none
     seed: int = 0
     center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
     threads: int = 1
     probe_every: int = defaults.PROBE_EVERY  # steps from one look at the gradients to the next
+
+
+def takes_much_memory(settings: Settings) -> bool:
+    """Whether layers with large maps are tuned, whose activations are most of a run's memory.
+
+    Then none is held longer than needed. With fewer layers there is nothing to gain: beside the
+    libraries the activations are small.
+    """
+    return settings.layers > defaults.LAYERS
 
 
 def sgm_blocks(settings: Settings) -> Blocks:

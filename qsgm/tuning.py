@@ -34,6 +34,7 @@ class StepLoop:
     ) -> None:
         self._session = session
         self._rates = dict(rates)
+        self._options: ort.RunOptions | None = None  # of the runs to come
         # Kept here, since bindings read these arrays' memory.
         self._data: dict[str, NDArray[Any]] = {
             "features": np.ascontiguousarray(features),
@@ -62,9 +63,21 @@ class StepLoop:
             self._data[f"rate{layer}"][...] = factor * rate
         binding = self._bindings[self._now]
         binding.bind_cpu_input("rows", rows)
-        self._session.run_with_iobinding(binding)
+        self._session.run_with_iobinding(binding, self._options)
         self._now = 1 - self._now
         return float(self._loss)
+
+    def put(self, features: Features, labels: Array) -> None:
+        """Other crops in the place of those the loop has: `rows` are then among these.
+
+        Nothing happens where they are the same arrays.
+        """
+        if features is self._data["features"]:
+            return
+        self._data |= {"features": features, "labels": labels}
+        for binding in self._bindings:
+            binding.bind_cpu_input("features", features)
+            binding.bind_cpu_input("labels", labels)
 
     def weights(self) -> dict[str, Array]:
         """A copy of the weights and biases as they are now."""

@@ -367,7 +367,7 @@ def test_run_lengths_that_are_no_numbers_of_epochs_are_refused(
 
 def test_ratios_compare_whole_jobs_and_steps_that_took_turns() -> None:
     medians = {
-        name: {"features": 1.0, "tuning": tuning, "process": 2.0}
+        name: {"features": 1.0, "tuning": tuning, "total": 4.0, "process": 2.0}
         for name, tuning in (("sgm int8", 2.0), ("sgm float", 1.6), ("bp", 3.0), ("torch bp", 5.0))
     }
     turns = {"forward": 1.0, "backprop": 3.5, "sgm_float": 2.0, "sgm_int8": 2.5}
@@ -377,6 +377,7 @@ def test_ratios_compare_whole_jobs_and_steps_that_took_turns() -> None:
     assert found["int8_step_over_float_step"] == 1.25
     assert found["bp_step_over_qsgm_step"] == 1.4
     assert found["torch_bp_step_over_qsgm_step"] == 2.5
+    assert found["qsgm_tuning_over_total"] == 0.5
     del medians["torch bp"]
     assert "torch_bp_step_over_qsgm_step" not in ratios(medians, turns)
 
@@ -389,6 +390,10 @@ def test_speed_runs_the_same_job_in_processes_of_their_own(
     assert set(report["seconds"]) >= {"sgm int8", "sgm float", "bp"}
     assert report["steps"] == 25
     assert report["ratios"]["torch_bp_step_over_qsgm_step"] > 0
+    # No peer was asked for; own steps are there all the same.
+    assert report["step_table_ms"] == {"1": report["in_turns_ms"]}
+    assert report["peers"] == {"1": {}}
+    assert report["not_measured"] == {}
 
 
 def test_speed_hands_its_settings_to_every_process(

@@ -35,6 +35,7 @@ FINETUNE_KEYS = {
     "fidelity",
     "seconds",
     "peak_activation_bytes",
+    "stream",
 }
 FIDELITY_KEYS = {
     "cos_int8_float",
@@ -156,6 +157,17 @@ def test_finetune_prints_one_json_object_with_the_stable_keys(
     assert all(layer.keys() >= FIDELITY_KEYS for layer in values["fidelity"].values())
     assert values["seconds"].keys() >= {"crops", "features", "tuning", "probes", "total"}
     assert set(values["peak_activation_bytes"]) == {"sgm", "backprop"}
+
+
+def test_a_streamed_object_is_the_same_object(
+    qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path
+) -> None:
+    start = ("finetune", "--json", "--epochs", 1, "--bundle", bundle_folder, "-o")
+    kept, streamed = tmp_path / "kept", tmp_path / "streamed"
+    assert qsgm(*start, kept, frame_path).json["stream"] is False
+    assert qsgm(*start, streamed, "--stream", frame_path).json["stream"] is True
+    networks = [(folder / "network.onnx").read_bytes() for folder in (kept, streamed)]
+    assert networks[0] == networks[1]
 
 
 def test_finetune_and_predict_for_people(

@@ -18,8 +18,10 @@ from qsgm.crops import (
     POSITIVE_JITTER_PX,
     CropPlan,
     cut_crops,
+    cut_widened,
     label_crops,
     plan_crops,
+    widened,
 )
 from qsgm.errors import QsgmError
 
@@ -63,6 +65,13 @@ def test_slices_of_the_plan_give_the_same_crops_as_the_whole() -> None:
     frame, whole = noise_frame(), plan(count=11)
     slices = [cut_crops(frame, whole[start : start + 4]) for start in range(0, 11, 4)]
     np.testing.assert_array_equal(np.concatenate(slices), cut_crops(frame, whole))
+
+
+def test_any_rows_of_the_plan_give_the_same_crops_as_the_whole() -> None:
+    frame, whole = noise_frame(), plan(count=11)
+    rows = np.array([7, 0, 10, 7])
+    crops = cut_widened(widened(frame), whole[rows])
+    np.testing.assert_array_equal(crops, cut_crops(frame, whole)[rows])
 
 
 @pytest.mark.parametrize("degrees", [-80, -45, -10, 0, 25, 60, 89])

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object, preparing, probing
 from qsgm.angles import encode_angle
 from qsgm.blocks import parse_blocks, single_layers
-from qsgm.bundle import Bundle, head_file
+from qsgm.bundle import Bundle, Precision, head_file
 from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
 from qsgm.finetuning import FinetuneResult, peak_activation_bytes, train
-from qsgm.preparing import Accuracy, accuracy_of, prepare
+from qsgm.preparing import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
 from qsgm.quantize import SgmRanges, constants, quantize_sgm
 from qsgm.report import finetune_json, to_json
 from qsgm.settings import Settings
+from qsgm.tuning import BATCH
 from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]
@@ -258,6 +259,75 @@ def test_the_report_beside_the_object_keeps_the_whole_run(
     assert report["fidelity"]["4"]["cos_int8_true"] == pytest.approx(mean, abs=1e-4)
 
 
+def assert_same_run(one: FinetuneResult, other: FinetuneResult) -> None:
+    """To the last bit."""
+    assert one.network() == other.network()
+    assert (one.zero_shot, one.accuracy) == (other.zero_shot, other.accuracy)
+    assert (one.losses, one.probes) == (other.losses, other.probes)
+    assert one.prepared.offset_rad == other.prepared.offset_rad
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        replace(SHORT, trunk="float"),
+        replace(SHORT, trunk="int8"),
+        replace(SHORT, method="bp", layers=2),
+        replace(SHORT, layers=1, optimizer="adam"),
+        replace(SHORT, recalibrate=True),
+    ],
+)
+def test_streamed_features_give_the_same_run_as_kept_ones(
+    frame: Frame, bundle: Bundle, settings: Settings
+) -> None:
+    streamed = finetune(frame, bundle, replace(settings, stream=True))
+    assert_same_run(streamed, finetune(frame, bundle, settings))
+    seconds = dict(streamed.seconds)
+    assert sum(seconds.values()) - seconds["total"] <= seconds["total"]
+
+
+@pytest.mark.usefixtures("few_crops")
+@pytest.mark.parametrize("layers", [4, 5, 6])
+def test_streamed_maps_give_the_same_run_as_kept_ones(
+    frame: Frame, bundle: Bundle, layers: int
+) -> None:
+    settings = Settings(layers=layers, epochs=1)
+    streamed = finetune(frame, bundle, replace(settings, stream=True))
+    assert_same_run(streamed, finetune(frame, bundle, settings))
+
+
+@pytest.mark.parametrize("trunk", ["float", "int8"])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_features_of_a_crop_are_the_same_in_any_batch(
+    frame: Frame, bundle: Bundle, trunk: Precision, layers: int
+) -> None:
+    settings = Settings(layers=layers, trunk=trunk, stream=True)
+    source = prepare(frame, bundle, settings).source
+    rows = np.random.default_rng(0).permutation(CROPS)[:75]
+    together = source.of(rows)
+    np.testing.assert_array_equal(source.of(rows[40:72]), together[40:72])
+    assert source.of(rows[:0]).shape == (0, *together.shape[1:])
+    alone = np.concatenate([source.of(rows[i : i + 1]) for i in range(10)])
+    np.testing.assert_array_equal(alone, together[:10])
+
+
+def test_a_streamed_run_never_makes_more_features_than_a_batch(
+    frame: Frame, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    plain = StreamedFeatures.of
+
+    def of(self: StreamedFeatures, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
+        made.append(len(rows))
+        return plain(self, rows)
+
+    monkeypatch.setattr(StreamedFeatures, "of", of)
+    result = finetune(frame, bundle, replace(SHORT, stream=True, recalibrate=True))
+    assert max(made) == BATCH
+    kept = {np.size(value) for value in vars(result.prepared.source).values()}
+    assert max(kept) < 2 * frame.size
+
+
 def test_stages_add_up_to_no_more_than_the_total(result: FinetuneResult) -> None:
     seconds = dict(result.seconds)
     total = seconds.pop("total")
@@ -281,7 +351,7 @@ def test_preparing_once_and_training_twice_equals_two_whole_runs(
 def test_progress_is_told_stage_by_stage(frame: Frame, bundle: Bundle) -> None:
     told: list[tuple[str, int, int]] = []
     finetune(frame, bundle, SHORT, lambda *what: told.append(what))
-    assert told[0] == ("crops", 10, CROPS)
+    assert told[0] == ("crops", SLICE, CROPS)
     assert told[-2:] == [("tuning", 1, 2), ("tuning", 2, 2)]
 
 

@@ -8,7 +8,7 @@ from onnx import helper
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, step_file, trunk_file
-from qsgm.runtime import open_session, running
+from qsgm.runtime import open_session, run_options, running
 from qsgm.train.graphs.inspection import integer_operators
 
 
@@ -35,6 +35,16 @@ def test_sessions_ask_for_exact_products_on_cpus_without_vnni(bundle: Bundle) ->
 def test_int8_sgms_run_as_integer_products_with_these_settings(bundle: Bundle) -> None:
     model = onnx.load(bundle.folder / step_file("int8", "sgd", single_layers(3)))
     assert set(integer_operators(model)) == {"QGemm"}
+
+
+def test_a_run_that_gives_its_memory_back_gives_the_same(bundle: Bundle) -> None:
+    session = bundle.session(trunk_file("float", 3))
+    feeds = {"crops": np.random.default_rng(0).integers(0, 256, (2, 128, 128, 3), np.uint8)}
+    options = run_options(give_memory_back=True)
+    assert options.get_run_config_entry("memory.enable_memory_arena_shrinkage") == "cpu:0"
+    plain, frugal, again = (session.run(None, feeds, some)[0] for some in (None, options, None))
+    np.testing.assert_array_equal(frugal, plain)
+    np.testing.assert_array_equal(again, plain)
 
 
 def test_what_is_no_graph_is_refused_in_one_line() -> None:

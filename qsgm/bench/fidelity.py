@@ -13,7 +13,7 @@ from qsgm.bench.accuracy import groups_of
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle
 from qsgm.finetuning import FinetuneResult, train
-from qsgm.preparing import Watch, prepare
+from qsgm.preparing import KeptFeatures, Watch, prepare
 from qsgm.report import accuracy_json, fidelity_json, number, plain_table
 from qsgm.settings import Settings
 
@@ -166,5 +166,5 @@ def measure_fidelity(
 
 def without_features(result: FinetuneResult) -> FinetuneResult:
     """The same result without what takes megabytes."""
-    light = replace(result.prepared, features=result.prepared.features[:0])
+    light = replace(result.prepared, source=KeptFeatures(result.prepared.source.of(np.arange(0))))
     return replace(result, prepared=light)

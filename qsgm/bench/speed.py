@@ -2,7 +2,8 @@
 
 Every variant runs several times, in turns, so that whatever else the machine does hits all of
 them; medians are reported. Single steps and forward passes, too short for that, take turns in one
-process a few hundred times. Ratios are what can be compared between machines.
+process a few hundred times, next to those of other frameworks (:mod:`qsgm.bench.peers_table`).
+Ratios are what can be compared between machines.
 """
 
 import importlib.util
@@ -19,7 +20,14 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 
-from qsgm.bench.step_jobs import step_seconds
+from qsgm.bench.peers_table import (
+    OWN_STEPS,
+    StepPlan,
+    StepTimes,
+    measure_steps,
+    render_steps,
+    steps_json,
+)
 from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
@@ -34,30 +42,27 @@ VARIANTS: Mapping[str, Sequence[str]] = {
     "bp": ("--method", "bp"),
 }
 TORCH = "torch bp"
-# Of each kind of step, and of a forward pass.
-TURNS = 400
 STAGES = ("crops", "features", "tuning", "total", "process")
 
 Seconds = dict[str, float]
 
 
 def measure_speed(
-    frame: Path, bundle: Bundle, settings: Settings, repeats: int, watch: Watch
+    frame: Path,
+    bundle: Bundle,
+    settings: Settings,
+    repeats: int,
+    watch: Watch,
+    plan: StepPlan = OWN_STEPS,
 ) -> dict[str, Any]:
-    """Medians of all variants and the ratios between them; torch where it is installed."""
-    with_torch = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
-    variants = [*VARIANTS, TORCH] if with_torch else [*VARIANTS]
-    runs: dict[str, list[Seconds]] = {name: [] for name in variants}
-    for repeat in range(repeats):
-        for done, name in enumerate(variants, start=1):
-            runs[name].append(run_once(name, frame, bundle, settings))
-            watch("runs", repeat * len(variants) + done, repeats * len(variants))
-    medians = {
-        name: {stage: median(run[stage] for run in some) for stage in STAGES}
-        for name, some in runs.items()
-    }
+    """Medians of all variants and the ratios between them; torch where it is installed.
+
+    `plan` says which other frameworks' steps to measure; without one, none.
+    """
+    medians = measure_jobs(frame, bundle, settings, repeats, watch)
+    times = measure_steps(frame, bundle, settings.layers, settings.threads, repeats, plan, watch)
     steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
-    turns = step_seconds(bundle, settings.layers, TURNS, settings.threads)
+    turns = times.own[settings.threads]
     return {
         "frame": str(frame),
         "bundle": str(bundle.folder),
@@ -75,7 +80,25 @@ def measure_speed(
             name: number(1000 * stages["tuning"] / steps, 4) for name, stages in medians.items()
         },
         "in_turns_ms": {name: number(1000 * value, 4) for name, value in turns.items()},
-        "ratios": ratios(medians, turns),
+        "ratios": ratios(medians, turns) | peer_ratios(times, settings.threads),
+        **steps_json(times),
+    }
+
+
+def measure_jobs(
+    frame: Path, bundle: Bundle, settings: Settings, repeats: int, watch: Watch
+) -> dict[str, Seconds]:
+    """Median seconds per stage of whole jobs, by variant."""
+    with_torch = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
+    variants = [*VARIANTS, TORCH] if with_torch else [*VARIANTS]
+    runs: dict[str, list[Seconds]] = {name: [] for name in variants}
+    for repeat in range(repeats):
+        for done, name in enumerate(variants, start=1):
+            runs[name].append(run_once(name, frame, bundle, settings))
+            watch("runs", repeat * len(variants) + done, repeats * len(variants))
+    return {
+        name: {stage: median(run[stage] for run in some) for stage in STAGES}
+        for name, some in runs.items()
     }
 
 
@@ -87,6 +110,7 @@ def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | 
         "float_step_over_forward": turns["sgm_float"] / turns["forward"],
         "int8_step_over_float_step": step / turns["sgm_float"],
         "bp_step_over_qsgm_step": turns["backprop"] / step,
+        "qsgm_tuning_over_total": own["tuning"] / own["total"],
     }
     if TORCH in medians:
         other = medians[TORCH]
@@ -96,6 +120,16 @@ def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | 
             "torch_process_over_qsgm_process": other["process"] / own["process"],
         }
     return {name: number(value, 3) for name, value in found.items()}
+
+
+def peer_ratios(times: StepTimes, threads: int) -> dict[str, float | None]:
+    """Each other framework's step, with SGD in the place of Adam, over the int8 one."""
+    steps = times.seconds(threads)
+    return {
+        f"{name}_step_over_qsgm_step": number(steps[name] / steps["sgm_int8"], 3)
+        for name in steps
+        if name not in times.own[threads]
+    }
 
 
 def run_once(
@@ -150,4 +184,4 @@ def render(report: Mapping[str, Any]) -> RenderableType:
     quotients.show_header = False
     for name, value in report["ratios"].items():
         quotients.add_row(name.replace("_", " "), f"{value:.2f}")
-    return Group(table, quotients)
+    return Group(table, quotients, render_steps(report))

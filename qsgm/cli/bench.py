@@ -23,8 +23,10 @@ from qsgm.cli.options import (
     ThreadsOption,
     TrunkOption,
     parsed_blocks,
+    parsed_interpreters,
     parsed_layer_counts,
     parsed_run_lengths,
+    parsed_thread_counts,
     parsed_variant,
     settings_of,
     value_of,
@@ -153,22 +155,40 @@ def bench_speed(
         int, typer.Option(min=1, max=10_000, help="Passes over 800 crops.")
     ] = defaults.EPOCHS,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of every variant.")] = 5,
+    peers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--peer",
+            metavar="NAME=PYTHON",
+            help="Python that has onnxruntime-training or executorch; repeatable.",
+        ),
+    ] = None,
+    thread_counts: Annotated[
+        str,
+        typer.Option(metavar="N,N", help="Of single steps, here and elsewhere; '' for none."),
+    ] = defaults.THREAD_COUNTS,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
     output: ReportOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Seconds per stage on the first frame, next to the same job in torch if it is installed."""
+    """Seconds per stage on the first frame, next to the same job in torch if it is installed.
+
+    Single steps stand next to those of torch, torch.compile, onnxruntime-training and executorch.
+    The last two need a Python of their own; what is missing is said, and the rest measured.
+    """
+    from qsgm.bench.peers_table import StepPlan
     from qsgm.bench.speed import measure_speed, render
     from qsgm.settings import Settings
 
+    plan = StepPlan(parsed_thread_counts(thread_counts), parsed_interpreters(peers or []))
     frame = frames_of(frames, 1)[0].path
     settings = Settings(
         layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
     )
     with progress() as watch:
-        report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch)
+        report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch, plan)
     write_report(report, output)
     show(report, render(report), as_json)
 
@@ -224,6 +244,31 @@ def bench_memory(
     write_report(report.to_json(), output)
     if picture is not None and chart is not None:
         chart.write_memory_chart(report, picture)
+    show(report.to_json(), report.render(), as_json)
+
+
+@app.command("growth")
+def bench_growth(
+    frames: FramesOption = None,
+    repeats: Annotated[int, typer.Option(min=1, max=10_000, help="Turns of every variant.")] = 100,
+    bundle: BundleOption = None,
+    output: ReportOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the growth, a PNG (matplotlib).")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """A step's time by batch, layers and width, a job's by its crops; where int8 wins (host)."""
+    host = host_module("qsgm.train.growth")
+    chart = None if picture is None else host_module("qsgm.train.growth_chart")
+    frame = frames_of(frames, 1)[0]
+    sizes = host.Sizes(repeats=repeats)
+    with progress() as watch:
+        report = host.measure_growth(frame, open_bundle(bundle), threads, sizes, watch)
+    write_report(report.to_json(), output)
+    if picture is not None and chart is not None:
+        chart.write_growth_chart(report, picture)
     show(report.to_json(), report.render(), as_json)
 
 

@@ -35,6 +35,7 @@ from qsgm.cli.options import (
     ReportOption,
     SceneArgument,
     SeedOption,
+    StreamOption,
     ThreadsOption,
     TrunkOption,
     parsed_blocks,
@@ -140,6 +141,21 @@ def fold_and_quantize(
 
 
 @app.command()
+def slim(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR")],
+    blocks: Annotated[
+        str, typer.Option(metavar="A-B,C", help="The one way of tuning that stays.")
+    ] = defaults.SLIM_BLOCKS,
+    bundle: BundleOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a small bundle of a whole one: what one way of tuning takes (host; needs onnx)."""
+    host = host_module("qsgm.train.slim")
+    report = host.slim_bundle(open_bundle(bundle), parsed_blocks(blocks), output)
+    show(report.to_json(), report, as_json)
+
+
+@app.command()
 def finetune(
     frame: FrameArgument,
     int8: PrecisionOption = None,
@@ -158,6 +174,7 @@ def finetune(
     optimizer: OptimizerOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
     recalibrate: RecalibrateOption = False,
+    stream: StreamOption = False,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
@@ -177,7 +194,7 @@ def finetune(
     settings = settings_of(
         int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
     )
-    settings = replace(settings, recalibrate=recalibrate)
+    settings = replace(settings, recalibrate=recalibrate, stream=stream)
     folder = paths.object_folder(frame) if output is None else output
     check_replaceable(folder, DESCRIPTION)
     result = _finetune(frame, open_bundle(bundle), settings)

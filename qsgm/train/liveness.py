@@ -135,8 +135,8 @@ def read_trace(graph: onnx.GraphProto, events: Sequence[Mapping[str, Any]]) -> T
     # There are no branches: every run takes every node, and loops always the same rounds.
     length = len(events) // names.count(graph.node[-1].name)
     assert names[:length] * (len(events) // length) == names, "a run of the profile is incomplete"
-    first = {name: run_of(nodes[name], event) for name, event in zip(names[:length], events)}
-    runs = with_loops_open([(nodes[name], run) for name, run in first.items()])
+    first = dict(zip(names[:length], events[:length], strict=True))
+    runs = with_loops_open([(nodes[name], run_of(nodes[name], e)) for name, e in first.items()])
     bound = frozenset(output.name for output in graph.output) | items_given(every)
     memory = [event["args"] for event in events]
     if not all(IN_USE in some for some in memory):
@@ -155,8 +155,7 @@ def with_loops_open(runs: Sequence[tuple[onnx.NodeProto, Run]]) -> list[Run]:
         if body:
             start = next(i for i, one in enumerate(opened) if one.name in body)
             opened.insert(start, replace(run, inputs=()))
-            run = replace(run, outputs={})
-        opened.append(run)
+        opened.append(replace(run, outputs={}) if body else run)
     return opened
 
 
