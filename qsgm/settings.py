@@ -13,7 +13,7 @@ class Settings:
     """How to tune; what is None is up to the bundle."""
 
     method: Method = "sgm"
-    precision: Precision = "int8"  # of the SGMs; backpropagation has one, float
+    precision: Precision = defaults.PRECISION  # of the SGMs; backpropagation has one, float
     layers: int = defaults.LAYERS  # how many of the last ones
     blocks: str | None = None  # those layers in groups, such as 4,5-6; None: each on its own
     trunk: Precision | None = None  # of the frozen layers

@@ -32,7 +32,7 @@ from qsgm.settings import Settings
 from qsgm.tuning import StepLoop, batches
 
 SHORT = Settings(epochs=1)
-MAIN = Settings(epochs=2)
+MAIN = Settings(precision="int8", epochs=2)
 CENTER = (320.0, 240.0)
 
 

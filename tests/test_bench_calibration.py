@@ -45,7 +45,7 @@ from qsgm.settings import Settings
 from qsgm.train.calibration_chart import write_calibration_chart
 from tests.conftest import draw_frame
 
-SHORT = Settings(epochs=1)
+SHORT = Settings(precision="int8", epochs=1)
 TWO = (Variant(16, 16, "minmax"), Variant(8, 8, "percentile"))
 
 

@@ -14,7 +14,7 @@ from qsgm.bench.frames import list_frames
 from qsgm.bundle import Bundle
 from qsgm.settings import Settings
 
-SHORT = Settings(epochs=1)
+SHORT = Settings(precision="int8", epochs=1)
 
 
 @pytest.fixture(scope="module")

@@ -370,7 +370,7 @@ def test_blocks_say_how_many_layers_to_tune(
         "finetune", "--epochs", 0, "--blocks", "4,5-6", "--bundle", bundle_folder, "-o",
         tmp_path / "bar", frame_path,
     )  # fmt: skip
-    assert "bar: blocks 4,5-6, sgm int8" in shown.out
+    assert "bar: blocks 4,5-6, sgm float" in shown.out
 
 
 def test_blocks_that_are_none_or_contradict_the_layers_are_a_usage_error(

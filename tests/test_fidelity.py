@@ -42,7 +42,7 @@ from qsgm.train.sgm_fidelity import update_from
 RNG = np.random.default_rng(0)
 GRADIENT = RNG.normal(size=(32, 16)).astype(np.float32)
 NOTHING = np.zeros_like(GRADIENT)
-SHORT = Settings(epochs=2)
+SHORT = Settings(precision="int8", epochs=2)
 BATCHES = arrays.arrays(
     np.float32, (5, 3, 2), elements=st.floats(-100, 100, width=32, allow_subnormal=False)
 )

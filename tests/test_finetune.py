@@ -24,7 +24,7 @@ from qsgm.tuning import BATCH
 from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]
-SHORT = Settings(epochs=2)
+SHORT = Settings(precision="int8", epochs=2)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180(bundle: 
 def test_every_method_tunes_every_number_of_layers(
     frame: Frame, bundle: Bundle, layers: int, method: str
 ) -> None:
-    settings = Settings(method=method, layers=layers, epochs=1)  # type: ignore[arg-type]
+    settings = Settings(precision="int8", method=method, layers=layers, epochs=1)  # type: ignore[arg-type]
     result = finetune(frame, bundle, settings)
     assert set(result.fidelity) == set(single_layers(layers).sgm_layers)
     assert (
@@ -143,12 +143,12 @@ def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("settings", "probed"),
     [
-        (Settings(layers=6, epochs=1), {1, 2, 3, 4, 5}),
-        (Settings(layers=6, blocks="1-4,5,6", epochs=1), {4, 5}),
-        (Settings(layers=6, method="bp", epochs=1), {1, 2, 3, 4, 5}),
+        (Settings(precision="int8", layers=6, epochs=1), {1, 2, 3, 4, 5}),
+        (Settings(precision="int8", layers=6, blocks="1-4,5,6", epochs=1), {4, 5}),
+        (Settings(precision="int8", layers=6, method="bp", epochs=1), {1, 2, 3, 4, 5}),
         (Settings(layers=5, precision="float", epochs=1), {2, 3, 4, 5}),
-        (Settings(layers=4, epochs=1), {3, 4, 5}),
-        (Settings(layers=3, blocks="4,5-6", epochs=1), {4}),
+        (Settings(precision="int8", layers=4, epochs=1), {3, 4, 5}),
+        (Settings(precision="int8", layers=3, blocks="4,5-6", epochs=1), {4}),
     ],
 )
 def test_all_layers_can_be_tuned_alone_or_in_blocks(
@@ -167,8 +167,8 @@ def test_all_layers_can_be_tuned_alone_or_in_blocks(
 def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
     frame: Frame, bundle: Bundle, tmp_path: Path
 ) -> None:
-    result = finetune(frame, bundle, Settings(layers=6, epochs=1))
-    untouched = finetune(frame, bundle, Settings(layers=6, epochs=0))
+    result = finetune(frame, bundle, Settings(precision="int8", layers=6, epochs=1))
+    untouched = finetune(frame, bundle, Settings(precision="int8", layers=6, epochs=0))
     assert untouched.network() == (bundle.folder / "network.onnx").read_bytes()
     result.save(tmp_path / "mug", "mug")
     tuned = load_object(tmp_path / "mug")
@@ -188,11 +188,17 @@ def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (Settings(layers=6, blocks="1-3,4,5,6"), "no step for the blocks 1-3,4,5,6; choose one of"),
-        (Settings(blocks="1-4,5,6"), "are the last 6 layers, the settings say 3"),
-        (Settings(blocks="4-6"), "leave no place for an SGM: pass --method bp"),
-        (Settings(blocks="4,5-6", method="bp"), "trains all layers as one block, 4-6"),
-        (Settings(blocks="4,6"), "gives no blocks of layers"),
+        (
+            Settings(precision="int8", layers=6, blocks="1-3,4,5,6"),
+            "no step for the blocks 1-3,4,5,6; choose one of",
+        ),
+        (Settings(precision="int8", blocks="1-4,5,6"), "are the last 6 layers, the settings say 3"),
+        (Settings(precision="int8", blocks="4-6"), "leave no place for an SGM: pass --method bp"),
+        (
+            Settings(precision="int8", blocks="4,5-6", method="bp"),
+            "trains all layers as one block, 4-6",
+        ),
+        (Settings(precision="int8", blocks="4,6"), "gives no blocks of layers"),
     ],
 )
 def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
@@ -205,18 +211,21 @@ def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
 
 
 def test_backpropagation_may_be_asked_for_by_its_one_block(frame: Frame, bundle: Bundle) -> None:
-    asked = finetune(frame, bundle, Settings(method="bp", blocks="4-6", epochs=1))
-    assert asked.network() == finetune(frame, bundle, Settings(method="bp", epochs=1)).network()
+    asked = finetune(frame, bundle, Settings(precision="int8", method="bp", blocks="4-6", epochs=1))
+    assert (
+        asked.network()
+        == finetune(frame, bundle, Settings(precision="int8", method="bp", epochs=1)).network()
+    )
 
 
 def test_backpropagation_lowers_the_loss(frame: Frame, bundle: Bundle) -> None:
-    result = finetune(frame, bundle, Settings(method="bp", epochs=6))
+    result = finetune(frame, bundle, Settings(precision="int8", method="bp", epochs=6))
     assert result.losses[-1] < 0.9 * result.losses[0]
     assert result.accuracy.detection_accuracy > result.zero_shot.detection_accuracy
 
 
 def test_no_epochs_leave_the_network_as_it_was(frame: Frame, bundle: Bundle) -> None:
-    result = finetune(frame, bundle, Settings(epochs=0))
+    result = finetune(frame, bundle, Settings(precision="int8", epochs=0))
     assert result.accuracy == result.zero_shot
     assert result.network() == (bundle.folder / "network.onnx").read_bytes()
     assert result.losses == ()
@@ -291,7 +300,7 @@ def test_streamed_features_give_the_same_run_as_kept_ones(
 def test_streamed_maps_give_the_same_run_as_kept_ones(
     frame: Frame, bundle: Bundle, layers: int
 ) -> None:
-    settings = Settings(layers=layers, epochs=1)
+    settings = Settings(precision="int8", layers=layers, epochs=1)
     streamed = finetune(frame, bundle, replace(settings, stream=True))
     assert_same_run(streamed, finetune(frame, bundle, settings))
 
@@ -301,7 +310,7 @@ def test_streamed_maps_give_the_same_run_as_kept_ones(
 def test_features_of_a_crop_are_the_same_in_any_batch(
     frame: Frame, bundle: Bundle, trunk: Precision, layers: int
 ) -> None:
-    settings = Settings(layers=layers, trunk=trunk, stream=True)
+    settings = Settings(precision="int8", layers=layers, trunk=trunk, stream=True)
     source = prepare(frame, bundle, settings).source
     rows = np.random.default_rng(0).permutation(CROPS)[:75]
     together = source.of(rows)

@@ -118,7 +118,7 @@ def test_grown_ranges_leave_labels_alone() -> None:
 
 
 def test_recalibration_mends_ranges_that_are_far_too_narrow(bundle: Bundle) -> None:
-    settings = Settings(epochs=1, layers=3)
+    settings = Settings(precision="int8", epochs=1, layers=3)
     prepared = prepare(draw_frame()[0], bundle, settings)
     activations = activations_before(prepared, settings)
     assert sorted(activations) == [4, 5]
@@ -140,7 +140,7 @@ def test_recalibration_mends_ranges_that_are_far_too_narrow(bundle: Bundle) -> N
 def test_vectors_behind_maps_are_calibrated_on_as_many_crops_as_without_maps(
     blocks: str, bundle: Bundle
 ) -> None:
-    settings = Settings(layers=len(parse_blocks(blocks).layers), blocks=blocks)
+    settings = Settings(precision="int8", layers=len(parse_blocks(blocks).layers), blocks=blocks)
     prepared = prepare(draw_frame()[0], bundle, settings)
     for layer, activation in activations_before(prepared, settings).items():
         crops, positions = activation.shape[:2]
@@ -181,14 +181,14 @@ def test_a_recalibrated_run_says_so_and_how_long_it_took(
 def test_a_bundle_without_a_probe_cannot_recalibrate(bundle: Bundle) -> None:
     files = {k: v for k, v in bundle.manifest["files"].items() if k != probe_file(3)}
     without = replace(bundle, manifest=bundle.manifest | {"files": files})
-    settings = Settings(epochs=1, recalibrate=True)
+    settings = Settings(precision="int8", epochs=1, recalibrate=True)
     with pytest.raises(QsgmError, match=r"has no probe_3.onnx, by which SGMs are looked at"):
         train(prepare(draw_frame()[0], without, settings), settings)
 
 
 def test_a_bundles_probe_takes_recalibrated_constants_for_all_its_sgms(bundle: Bundle) -> None:
     rng = np.random.default_rng(3)
-    settings = Settings(epochs=0, layers=3)
+    settings = Settings(precision="int8", epochs=0, layers=3)
     prepared = prepare(draw_frame()[0], bundle, settings)
     exchanged = recalibrated(bundle, activations_before(prepared, settings))
     session = bundle.session(probe_file(3), 1, constants_of(exchanged, (4, 5)))

@@ -30,10 +30,10 @@ def slim(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 @pytest.mark.parametrize(
     "settings",
     [
-        Settings(epochs=1),
+        Settings(precision="int8", epochs=1),
         Settings(epochs=1, precision="float"),
-        Settings(epochs=1, method="bp"),
-        Settings(epochs=1, recalibrate=True),
+        Settings(precision="int8", epochs=1, method="bp"),
+        Settings(precision="int8", epochs=1, recalibrate=True),
     ],
 )
 def test_tuning_with_it_gives_the_same_bits(
@@ -53,10 +53,16 @@ def test_tuning_with_it_gives_the_same_bits(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (Settings(layers=2), "has no step for the blocks 5,6; choose one of 4,5,6"),
-        (Settings(layers=6), "can tune 3 layers at most"),
-        (Settings(optimizer="adam"), "has no rates for adam on the blocks 4,5,6"),
-        (Settings(trunk="int8"), "was made without trunk_int8_3.onnx; pass another --bundle"),
+        (
+            Settings(precision="int8", layers=2),
+            "has no step for the blocks 5,6; choose one of 4,5,6",
+        ),
+        (Settings(precision="int8", layers=6), "can tune 3 layers at most"),
+        (Settings(precision="int8", optimizer="adam"), "has no rates for adam on the blocks 4,5,6"),
+        (
+            Settings(precision="int8", trunk="int8"),
+            "was made without trunk_int8_3.onnx; pass another --bundle",
+        ),
     ],
 )
 def test_what_it_was_made_without_is_refused(

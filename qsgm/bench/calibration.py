@@ -243,7 +243,7 @@ def measure_calibration(
         frames: to judge on, one by one; none should be in the calibration sets.
         calibration_folder: that the sets are made of.
         bundle: whose SGMs are quantized; of 16 bit activations.
-        settings: of every run.
+        settings: of every run but for the precision: all variants are int8.
         variants: calibrators and bits.
         watch: told about progress.
 
@@ -251,6 +251,7 @@ def measure_calibration(
         QsgmError: a frame cannot be used, the bundle's SGMs have another number of bits, or a run
             diverged.
     """
+    settings = replace(settings, precision="int8")
     layers = tuned_layers(settings.layers)[:-1]
     if any(bundle.activation_bits(layer) != 16 for layer in layers):
         raise QsgmError(

@@ -152,6 +152,7 @@ def measure_fidelity(
     Raises:
         QsgmError: a frame cannot be read, the bundle has no such SGMs, or training diverged.
     """
+    settings = replace(settings, precision="int8")
     int8, floating = [], []
     for done, frame in enumerate(frames):
         watch("runs", done, len(frames))

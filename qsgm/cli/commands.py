@@ -191,8 +191,9 @@ def finetune(
     from qsgm.tuned import DESCRIPTION
 
     tuned = tuned_layers(layers, blocks)
+    wanted = recalibrate if int8 is None else int8  # it is int8 SGMs that are calibrated
     settings = settings_of(
-        int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
+        wanted, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
     )
     settings = replace(settings, recalibrate=recalibrate, stream=stream)
     folder = paths.object_folder(frame) if output is None else output
@@ -241,7 +242,9 @@ def predict(
 @app.command()
 def fidelity(
     frame: FrameArgument,
-    int8: PrecisionOption = None,
+    int8: Annotated[
+        bool, typer.Option("--int8/--float", help="Precision of the SGMs that drive the run.")
+    ] = True,
     layers: Annotated[
         int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
     ] = defaults.LAYERS,

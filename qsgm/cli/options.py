@@ -82,7 +82,7 @@ BundleOption = Annotated[
 ]
 PrecisionOption = Annotated[
     bool | None,
-    typer.Option("--int8/--float", help="Precision of the SGMs.", show_default="int8"),
+    typer.Option("--int8/--float", help="Precision of the SGMs.", show_default=defaults.PRECISION),
 ]
 MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
 LayersOption = Annotated[
@@ -99,7 +99,8 @@ TrunkOption = Annotated[
     TrunkChoice | None, typer.Option(help="Precision of the frozen layers; default: the bundle's.")
 ]
 RecalibrateOption = Annotated[
-    bool, typer.Option("--recalibrate", help="Fit the int8 SGMs' ranges to this object's crops.")
+    bool,
+    typer.Option("--recalibrate", help="Fit the ranges of the SGMs, then int8, to this object."),
 ]
 StreamOption = Annotated[
     bool,
@@ -152,7 +153,7 @@ def settings_of(
         complain("note: backpropagation runs in float; --int8 concerns SGMs only")
     return Settings(
         method=method.value,
-        precision="float" if int8 is False or method is MethodName.BP else "int8",
+        precision="int8" if int8 and method is MethodName.SGM else "float",
         layers=layers,
         blocks=blocks,
         trunk=value_of(trunk),
