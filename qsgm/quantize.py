@@ -3,7 +3,8 @@
 One u8 or s8 number is too coarse to keep a gradient's direction where gradients are small, so a
 number may take two: a weight is 256 * coarse + fine, an activation 256 * high + low. Products of
 such planes are u8 x s8 products all the same, and all but low * fine, too small to matter, are
-computed. A weight always has two planes; an activation has one (8 bits) or two (16 bits).
+computed. A weight always has two planes; an activation has one (8 bits) or two (16 bits). Graphs
+hold s8 weights as u8 around a zero point, which is exact on every CPU (:func:`around_zero_point`).
 
 Every channel has a scale of its own, and none of them costs anything at run time:
 

@@ -16,10 +16,6 @@ _CONFIG = {
     # Spinning threads starve whatever else runs on a small device, and buy nothing at this size.
     "session.intra_op.allow_spinning": "0",
     "session.inter_op.allow_spinning": "0",
-    # x86 CPUs without VNNI add pairs of u8 s8 products in 16 bits, which saturate: without this an
-    # emulated Haswell gave gradients down to a cosine of 0.994 to those of a CPU with VNNI, with it
-    # (ONNX Runtime makes the s8 weights u8) the same bits.
-    "session.x64quantprecision": "1",
 }
 _NONE: Mapping[str, NDArray[Any]] = MappingProxyType({})
 # What a graph raises when it runs: ONNX Runtime's own types have no common one, and its Python

@@ -7,29 +7,45 @@ from onnx import helper
 
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
-from qsgm.bundle import Bundle, step_file, trunk_file
+from qsgm.bundle import Bundle, probe_file, step_file, trunk_file
+from qsgm.quantize import U8_ZERO, around_zero_point
 from qsgm.runtime import open_session, run_options, running
 from qsgm.train.graphs.inspection import integer_operators
 
 
-def test_products_of_u8_and_s8_are_exact_where_pairs_exceed_16_bits() -> None:
-    """On CPUs without VNNI only with the setting below; those with it need none."""
+@pytest.mark.parametrize(
+    "name",
+    [
+        trunk_file("int8", 3),
+        probe_file(3),
+        step_file("int8", "sgd", single_layers(3)),
+        step_file("int8", "sgd", single_layers(6)),
+    ],
+)
+def test_no_graph_multiplies_by_s8_which_saturates_on_cpus_without_vnni(
+    bundle: Bundle, name: str
+) -> None:
+    graph = onnx.load(bundle.folder / name).graph
+    kinds = {tensor.data_type for tensor in graph.initializer}
+    assert onnx.TensorProto.UINT8 in kinds
+    assert onnx.TensorProto.INT8 not in kinds
+
+
+def test_weights_around_their_zero_point_are_exact_where_pairs_exceed_16_bits() -> None:
     weight = np.tile(np.array([127, -128, 127, 127], np.int8), (4, 2)).T  # (8, 4)
-    node = helper.make_node("MatMulInteger", ["x", "weight"], ["y"])
+    node = helper.make_node("MatMulInteger", ["x", "weight", "", "zero"], ["y"])
     x_info = helper.make_tensor_value_info("x", onnx.TensorProto.UINT8, ["rows", 8])
     y_info = helper.make_tensor_value_info("y", onnx.TensorProto.INT32, ["rows", 4])
-    constant = onnx.numpy_helper.from_array(weight, "weight")
-    graph = helper.make_graph([node], "product", [x_info], [y_info], [constant])
+    constants = [
+        onnx.numpy_helper.from_array(around_zero_point(weight), "weight"),
+        onnx.numpy_helper.from_array(np.array(U8_ZERO, np.uint8), "zero"),
+    ]
+    graph = helper.make_graph([node], "product", [x_info], [y_info], constants)
     opsets = [helper.make_opsetid("", 17)]
     model = helper.make_model(graph, opset_imports=opsets, ir_version=9)
     x = np.full((3, 8), 255, np.uint8)
     (product,) = open_session(model.SerializeToString()).run(None, {"x": x})
     np.testing.assert_array_equal(product, x.astype(int) @ weight.astype(int))
-
-
-def test_sessions_ask_for_exact_products_on_cpus_without_vnni(bundle: Bundle) -> None:
-    options = bundle.session(trunk_file("float", 3)).get_session_options()
-    assert options.get_session_config_entry("session.x64quantprecision") == "1"
 
 
 def test_int8_sgms_run_as_integer_products_with_these_settings(bundle: Bundle) -> None:

@@ -151,7 +151,7 @@ def test_onnx_runtime_computes_an_int8_layer_bit_for_bit(
     layer = quantize_trunk(one, {1: LayerRange(high[0], high[1] if pool else high[0])})[1]
     graph = Graph("layer")
     maps = graph.input("x", np.uint8, ("n", shape[1], side, side))
-    codes = int8_layer(graph.within("layer1"), 1, layer, maps)
+    codes = int8_layer(graph.within("layer1"), layer, maps)
     side_after = 1 if pool else out
     graph.output("codes", codes, np.uint8, ("n", shape[0], side_after, side_after))
     x = rng.integers(0, 256, (3, shape[1], side, side), dtype=np.uint8)
@@ -193,7 +193,7 @@ def test_every_convolution_of_the_int8_trunk_runs_in_integers(
 def test_a_trunk_with_a_convolution_in_float_is_refused(layers: dict[int, QuantizedLayer]) -> None:
     graph = Graph("trunk")
     x = graph.input("x", np.uint8, ("n", 3, 9, 9))
-    int8_layer(graph.within("layer1"), 1, layers[1], x)
+    int8_layer(graph.within("layer1"), layers[1], x)
     conv = next(node for node in graph.nodes if node.op_type == "Conv")
     del graph.nodes[graph.nodes.index(conv) + 1 :]  # no longer rounded: nothing to fuse it with
     graph.output("y", conv.output[0], np.float32, ("n", 8, 3, 3))

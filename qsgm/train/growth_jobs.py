@@ -148,12 +148,7 @@ def opened(model: ModelProto, threads: int) -> ort.InferenceSession:
 
 def opened_with_s8(model: ModelProto, threads: int) -> ort.InferenceSession:
     """A session that multiplies u8 by s8: exact where the CPU has VNNI, elsewhere it saturates."""
-    options = ort.SessionOptions()  # those of every other session make s8 weights u8
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    data = with_s8_weights(model).SerializeToString()
-    return ort.InferenceSession(data, options, ["CPUExecutionProvider"])
+    return opened(with_s8_weights(model), threads)
 
 
 def with_s8_weights(model: ModelProto) -> ModelProto:

@@ -1,5 +1,7 @@
 """The frozen layers in int8: u8 maps in, u8 maps out, s8 weights, int32 biases.
 
+Graphs hold the weights as those of SGMs: see :func:`qsgm.quantize.around_zero_point`.
+
 As in the SGMs every channel has a scale of its own at no cost. A channel's value is its step times
 its u8 code, and the weights absorb the steps of the maps on both sides. All maps are then left
 with scale 1 and zero point 0, a bias has exactly its weight row's scale, and rounding to u8 is the

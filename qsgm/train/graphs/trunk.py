@@ -7,6 +7,7 @@ from onnx import ModelProto, TensorProto
 
 from qsgm.angles import AngleEncoding
 from qsgm.errors import QsgmError
+from qsgm.quantize import U8_ZERO, around_zero_point
 from qsgm.train.fold import FoldedNet, on_pixels
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import CROP_SIDE, features_dtype, input_side, normalized
@@ -46,7 +47,7 @@ def int8_trunk_model(
     graph = Graph("trunk")
     x = graph.within("trunk").Transpose(declare_crops(graph), perm=(0, 3, 1, 2))
     for number in range(1, last_frozen + 1):
-        x = int8_layer(graph.within(f"layer{number}"), number, layers[number], x)
+        x = int8_layer(graph.within(f"layer{number}"), layers[number], x)
     x = graph.within("trunk").Transpose(x, perm=(0, 2, 3, 1))
     report_features(graph, net, last_frozen, x)
     return graph.model()
@@ -73,17 +74,14 @@ def rounded(op: Ops, net: FoldedNet, last_frozen: int, x: Value) -> Value:
     return op.QuantizeLinear(x, op.constant(steps), zero_point, axis=1)
 
 
-def int8_layer(op: Ops, number: int, layer: QuantizedLayer, x: Value) -> Value:
+def int8_layer(op: Ops, layer: QuantizedLayer, x: Value) -> Value:
     """u8 maps (N, Ci, H, W) to u8 maps: what ONNX Runtime makes one QLinearConv of, and a pool.
 
     ReLU costs no node: rounding to u8 clips at zero.
     """
     scale = op.constant(layer.scale)
-    # Neither weight nor zero point is shared, equal or not: where the runtime makes them u8 (see
-    # :mod:`qsgm.runtime`) it refuses to convert the same constant twice.
-    weight = op.graph.initializer(f"int8_weight{number}", layer.weight)
-    no_offset = np.zeros(len(layer.weight), np.int8)
-    zero_point = op.graph.initializer(f"int8_zero_point{number}", no_offset)
+    weight = op.constant(around_zero_point(layer.weight), np.uint8)
+    zero_point = op.constant(np.full(len(layer.weight), U8_ZERO), np.uint8)
     summed = op.Conv(
         from_u8(op, x),
         op.DequantizeLinear(weight, scale, zero_point, axis=0),
