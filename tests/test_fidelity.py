@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch.nn import functional as F
 
-from qsgm import QsgmError, defaults
+from qsgm import QsgmError, defaults, probing
 from qsgm.bundle import MANIFEST, Bundle, load_bundle, probe_file
 from qsgm.fidelity import (
     PROBED,
@@ -38,6 +38,7 @@ from qsgm.report import fidelity_command_json, fidelity_command_report
 from qsgm.settings import Settings
 from qsgm.train.local import LayerState, columns, layer_forward
 from qsgm.train.sgm_fidelity import update_from
+from qsgm.tuning import BATCH
 
 RNG = np.random.default_rng(0)
 GRADIENT = RNG.normal(size=(32, 16)).astype(np.float32)
@@ -283,3 +284,19 @@ def test_a_bundle_whose_probe_gives_less_is_refused_in_one_line(
     assert "export it again with `qsgm fold-and-quantize`" in said
     assert "\n" not in said
     assert train(prepare(frame, old, SHORT), replace(SHORT, epochs=0), probe=False).probes == ()
+
+
+def test_a_probe_in_pieces_says_what_a_probe_of_the_whole_batch_says(
+    frame: NDArray[np.uint8], bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(precision="int8", layers=4, epochs=1)
+    prepared = prepare(frame, bundle, settings)
+    pieces = train(prepared, settings).probes
+    monkeypatch.setattr(probing, "PROBE_SLICE", BATCH)
+    for piece, whole in zip(pieces, train(prepared, settings).probes, strict=True):
+        for layer, expected in whole.layers.items():
+            found, wanted = asdict(piece.layers[layer]), asdict(expected)
+            # Pieces have different numbers of values other than zero, of which this is a share.
+            shares = found.pop("underflow_fraction"), wanted.pop("underflow_fraction")
+            assert shares[0] == pytest.approx(shares[1], abs=0.01)
+            assert found == pytest.approx(wanted, rel=1e-3, abs=1e-6)

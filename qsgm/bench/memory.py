@@ -44,7 +44,10 @@ PEAK_LEGEND = (
     "activations alive at once, without weights, states, inputs and outputs; at best: all layers' "
     "outputs over the largest layer's, what SGMs would save if nothing else took memory"
 )
-ALIVE_LEGEND = "Gather: windows cut for a product, of a layer or of an SGM"
+ALIVE_LEGEND = (
+    "Gather: windows cut for a product, of a layer or of an SGM; Scan: what a layer that goes crop "
+    "by crop gives for all crops; batch: the crops themselves"
+)
 PROCESS_LEGEND = (
     "most that a whole process held, libraries and all crops' features included; "
     "probes: whether it looked at its gradients' fidelity, as it does by default"

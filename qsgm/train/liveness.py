@@ -197,17 +197,24 @@ def live_peak(runs: Sequence[Run], bound: AbstractSet[str]) -> Peak:
         bound: values whose memory is given; they count nothing.
     """
     tensors = lifetimes(runs, bound)
+    makers = {value: run for run in runs for value in run.outputs}
     change = np.zeros(len(runs) + 1, np.int64)
     for tensor in tensors.values():
         change[tensor.first] += tensor.bytes
         change[tensor.last + 1] -= tensor.bytes
     moment = int(np.argmax(np.cumsum(change[:-1])))
     alive = {
-        name: tensor.bytes
-        for name, tensor in sorted(tensors.items(), key=lambda item: -item[1].bytes)
+        titled(value, makers[value]): tensor.bytes
+        for value, tensor in sorted(tensors.items(), key=lambda item: -item[1].bytes)
         if tensor.first <= moment <= tensor.last
     }
-    return Peak(sum(alive.values()), runs[moment].name, alive)
+    return Peak(sum(alive.values()), titled(runs[moment].name, runs[moment]), alive)
+
+
+def titled(name: str, run: Run) -> str:
+    """A node's or a value's name with what the node does in it: layer4/7 is layer4/Gather_7."""
+    scope, slash, number = name.rpartition("/")
+    return f"{scope}/{run.op_type}_{number}" if slash else name
 
 
 def lifetimes(runs: Sequence[Run], bound: AbstractSet[str]) -> dict[str, Tensor]:
