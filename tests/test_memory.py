@@ -22,8 +22,8 @@ from qsgm.bench.memory import (
     MemoryReport,
     StepMemory,
     agreement,
-    at_best,
     measure_memory,
+    outputs_alone,
     resident_bytes,
     without_probes,
 )
@@ -81,13 +81,13 @@ def test_ratios_and_processes_are_reported_by_layers_and_batch(report: MemoryRep
     assert values["processes_without_probes"]["3"] == dict.fromkeys((INT8, FLOAT, BP), 300 * MB)
 
 
-def test_what_sgms_save_at_best_is_all_outputs_over_the_largest_layers() -> None:
+def test_counting_outputs_alone_sgms_save_all_but_the_largest_layers() -> None:
     # Convolution and ReLU: 8x62x62, 8x29x29, 16x13x13, 16x5x5, 16x1x1, twice each; the pool behind
     # layer 4, 16x1x1; layer 6, 3x1x1. That is 61504, 13456, 5408, 816, 32 and 3 numbers.
-    assert at_best(6) == pytest.approx(81_219 / 61_504, rel=1e-12)
-    assert at_best(3) == pytest.approx(851 / 816, rel=1e-12)
-    assert at_best(2) == pytest.approx(35 / 32, rel=1e-12)
-    assert at_best(1) == 1
+    assert outputs_alone(6) == pytest.approx(81_219 / 61_504, rel=1e-12)
+    assert outputs_alone(3) == pytest.approx(851 / 816, rel=1e-12)
+    assert outputs_alone(2) == pytest.approx(35 / 32, rel=1e-12)
+    assert outputs_alone(1) == 1
 
 
 def test_the_tables_fit_into_80_columns_and_name_what_is_alive(report: MemoryReport) -> None:
@@ -179,7 +179,7 @@ def test_the_picture_shows_every_peak_and_nothing_sticks_out(
     assert {text.get_text() for text in right.texts} == {
         "SGM int8 4.00",
         "SGM float 2.00",
-        "at best 1.32",
+        "outputs 1.32",
     }
     figure.draw_without_rendering()
     box = figure.get_tightbbox()

@@ -5,14 +5,15 @@ the shapes they really give: from the optimized model and the profile of one ste
 from the node that makes it to the last one that reads it. Views (:data:`VIEWS`) are their input;
 where a kernel may write over an input (:data:`IN_PLACE`) that nobody reads any more, it does. Not
 counted: constants, the graph's inputs, its bound outputs, and what a kernel needs for itself. Of
-a loop's rounds, which are all alike, the first one stands for all; what it gives lies in the loop's
-own results from the start.
+a loop's rounds, which are all alike, one stands for all; what it gives for its items lies in the
+loop's own results, and its sums go back and forth between two copies.
 
 The same profile says what the runtime asked its allocator for, against which this is checked.
 """
 
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
@@ -136,8 +137,9 @@ def read_trace(graph: onnx.GraphProto, events: Sequence[Mapping[str, Any]]) -> T
     length = len(events) // names.count(graph.node[-1].name)
     assert names[:length] * (len(events) // length) == names, "a run of the profile is incomplete"
     first = dict(zip(names[:length], events[:length], strict=True))
-    runs = with_loops_open([(nodes[name], run_of(nodes[name], e)) for name, e in first.items()])
-    bound = frozenset(output.name for output in graph.output) | items_given(every)
+    ran = [(nodes[name], run_of(nodes[name], event)) for name, event in first.items()]
+    runs = with_loops_open(ran, Counter(names[:length]))
+    bound = frozenset(output.name for output in graph.output) | given_to_loops(every)
     memory = [event["args"] for event in events]
     if not all(IN_USE in some for some in memory):
         return Trace(tuple(runs), bound, None, ())
@@ -147,31 +149,38 @@ def read_trace(graph: onnx.GraphProto, events: Sequence[Mapping[str, Any]]) -> T
     return Trace(tuple(runs), bound, before, tuple(most))
 
 
-def with_loops_open(runs: Sequence[tuple[onnx.NodeProto, Run]]) -> list[Run]:
-    """A loop's results in front of its body, and it reads its inputs behind it."""
+def with_loops_open(
+    runs: Sequence[tuple[onnx.NodeProto, Run]], rounds: Mapping[str, int]
+) -> list[Run]:
+    """A loop makes its results and copies in front of its body, and reads its inputs behind it.
+
+    `rounds` says how often each node ran.
+    """
     opened: list[Run] = []
     for node, run in runs:
         body = {inner.name for graph in bodies(node) for inner in all_nodes(graph)}
         if body:
             start = next(i for i, one in enumerate(opened) if one.name in body)
-            opened.insert(start, replace(run, inputs=()))
-        opened.append(replace(run, outputs={}) if body else run)
+            copies = copies_of_sums(node, run, rounds[opened[start].name])
+            opened.insert(start, replace(run, inputs=(), outputs={**run.outputs, **copies}))
+            opened.append(replace(run, inputs=(*run.inputs, *copies), outputs={}))
+        else:
+            opened.append(run)
     return opened
 
 
-def items_given(nodes: Sequence[onnx.NodeProto]) -> frozenset[str]:
-    """What the bodies of loops give item by item: it lies in the loops' results."""
+def copies_of_sums(loop: onnx.NodeProto, run: Run, rounds: int) -> dict[str, int]:
+    """Bytes of what a loop holds its sums in until the last round, which writes the results."""
+    items = next(int(one.i) for one in loop.attribute if one.name == "num_scan_inputs")
+    sums = loop.output[: len(loop.input) - items]
+    return {f"{name}_{i}": run.outputs[name] for name in sums for i in range(min(2, rounds - 1))}
+
+
+def given_to_loops(nodes: Sequence[onnx.NodeProto]) -> frozenset[str]:
+    """What the bodies of loops give: it lies in the loops' results and copies."""
     return frozenset(
-        output.name
-        for node in nodes
-        for body in bodies(node)
-        for output in body.output[len(node.input) - items_read(node) :]
+        output.name for node in nodes for body in bodies(node) for output in body.output
     )
-
-
-def items_read(loop: onnx.NodeProto) -> int:
-    """How many of a loop's inputs it goes through item by item; the others come before them."""
-    return next(int(one.i) for one in loop.attribute if one.name == "num_scan_inputs")
 
 
 def run_of(node: onnx.NodeProto, event: Mapping[str, Any]) -> Run:

@@ -24,9 +24,10 @@ from qsgm.train.graphs.optimizers import Gradient, value_of
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
-# Numbers in the windows of one crop, above which a block with an SGM goes crop by crop: what it
-# costs to do so is then little beside the work.
-MANY_NUMBERS = 100_000
+# Numbers in the windows of one crop, above which a block with an SGM goes crop by crop. Layers 1
+# and 2 are quicker so; layer 3, the smallest above, adds a tenth to a step of four layers, which
+# then takes a quarter of the memory; layer 4, below, would take longer for calls than for its work.
+MANY_NUMBERS = 30_000
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
 
