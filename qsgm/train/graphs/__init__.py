@@ -2,7 +2,7 @@
 
 build       a graph, operator by operator; a loop over crops
 trunk       the network with constant weights: crops to features, a frame to its heatmap
-layers      one tuned layer: forward, back through its activation, weight gradient, back to its input
+layers      one tuned layer: forward, back through its activation, its gradients, back to its input
 loss        output activation, loss and the error it starts with
 sgm         a static SGM in float and in int8
 optimizers  SGD with momentum and Adam, one parameter at a time
