@@ -372,12 +372,12 @@ def test_ratios_compare_whole_jobs_and_steps_that_took_turns() -> None:
     }
     turns = {"forward": 1.0, "backprop": 3.5, "sgm_float": 2.0, "sgm_int8": 2.5}
     found = ratios(medians, turns)
-    assert found["qsgm_step_over_forward"] == 2.5
-    assert found["float_step_over_forward"] == 2
+    assert found["qsgm_step_over_forward"] == found["float_step_over_forward"] == 2
+    assert found["int8_step_over_forward"] == 2.5
     assert found["int8_step_over_float_step"] == 1.25
-    assert found["bp_step_over_qsgm_step"] == 1.4
-    assert found["torch_bp_step_over_qsgm_step"] == 2.5
-    assert found["qsgm_tuning_over_total"] == 0.5
+    assert found["bp_step_over_qsgm_step"] == 1.75
+    assert found["torch_bp_step_over_qsgm_step"] == 3.125
+    assert found["qsgm_tuning_over_total"] == 0.4
     del medians["torch bp"]
     assert "torch_bp_step_over_qsgm_step" not in ratios(medians, turns)
 

@@ -249,8 +249,8 @@ def test_what_is_missing_is_said_and_the_rest_measured(
     for threads, steps in report["step_table_ms"].items():
         assert set(steps) == own | {"torch_eager"}
         assert steps["torch_eager"] == int(threads)
-        ratio = report["step_over_int8_step"][threads]["torch_eager"]
-        assert ratio == pytest.approx(int(threads) / steps["sgm_int8"], rel=1e-3)
+        ratio = report["step_over_qsgm_step"][threads]["torch_eager"]
+        assert ratio == pytest.approx(int(threads) / steps["sgm_float"], rel=1e-3)
         assert report["peers"][threads]["torch_eager"]["processes"] == 2
         assert report["peers"][threads]["torch_eager"]["setup_again_seconds"] == 2
     assert set(report["not_measured"]) == {"onnxruntime-training", "executorch"}
@@ -298,7 +298,7 @@ def test_the_table_of_all_peers_fits_into_80_columns() -> None:
     once: Mapping[str, Any] = {"import_seconds": 12.34, "setup_seconds": 123.45}
     report = {
         "step_table_ms": {"1": own | names, "2": own | names},
-        "step_over_int8_step": {"1": own | names, "2": own | names},
+        "step_over_qsgm_step": {"1": own | names, "2": own | names},
         "peers": {"1": dict.fromkeys(names, once), "2": {}},
         "not_measured": {},
     }

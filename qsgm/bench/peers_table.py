@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from qsgm import defaults
 from qsgm.bench.peers import PEERS, Peer, PeerRun, run_peer, write_job
 from qsgm.bench.step_jobs import step_seconds
 from qsgm.bench.tables import right_table
@@ -25,6 +26,7 @@ from qsgm.tuning import BATCH
 
 # Of each kind of own step, and of a forward pass.
 TURNS = 400
+OWN_STEP = f"sgm_{defaults.PRECISION}"  # that others are compared with
 OWN = {"forward": "forward", "sgm_int8": "sgm int8", "sgm_float": "sgm float", "backprop": "bp"}
 
 
@@ -145,8 +147,8 @@ def steps_json(times: StepTimes) -> dict[str, Any]:
             count: {name: number(1000 * value, 4) for name, value in some.items()}
             for count, some in table.items()
         },
-        "step_over_int8_step": {
-            count: {name: number(value / some["sgm_int8"], 3) for name, value in some.items()}
+        "step_over_qsgm_step": {
+            count: {name: number(value / some[OWN_STEP], 3) for name, value in some.items()}
             for count, some in table.items()
         },
         "peers": {
@@ -178,11 +180,13 @@ def runs_json(runs: Sequence[PeerRun]) -> dict[str, Any]:
 
 def render_steps(report: Mapping[str, Any]) -> RenderableType:
     """A row per kind of step, a pair of columns per number of threads; below, what is missing."""
-    table = right_table(f"a training step, batch {BATCH}: ms, and over the sgm int8 step", "")
+    table = right_table(
+        f"a training step, batch {BATCH}: ms, and over the {OWN[OWN_STEP]} step", ""
+    )
     table.columns[0].justify, table.columns[0].no_wrap = "left", True
     counts = list(report["step_table_ms"])
     for count in counts:
-        for heading in (f"{count} thread{'' if count == '1' else 's'}", "/ int8"):
+        for heading in (f"{count} thread{'' if count == '1' else 's'}", "/"):
             table.add_column(heading, justify="right")
     for heading in ("import s", "set-up s"):
         table.add_column(heading, justify="right")
@@ -200,7 +204,7 @@ def step_cells(report: Mapping[str, Any], count: str, key: str) -> tuple[str, st
     value = report["step_table_ms"][count].get(key)
     if value is None:
         return "", ""
-    return f"{value:.3f}", f"{report['step_over_int8_step'][count][key]:.2f}"
+    return f"{value:.3f}", f"{report['step_over_qsgm_step'][count][key]:.2f}"
 
 
 def once_cells(report: Mapping[str, Any], key: str) -> list[str]:

@@ -20,7 +20,9 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 
+from qsgm import defaults
 from qsgm.bench.peers_table import (
+    OWN_STEP,
     OWN_STEPS,
     StepPlan,
     StepTimes,
@@ -103,12 +105,16 @@ def measure_jobs(
 
 
 def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | None]:
-    """Between whole jobs, and between steps and forward passes that took turns."""
-    own, step = medians["sgm int8"], turns["sgm_int8"]
+    """Between whole jobs, and between steps and forward passes that took turns.
+
+    `qsgm` is what `qsgm finetune` does unless it is told otherwise.
+    """
+    own, step = medians[f"sgm {defaults.PRECISION}"], turns[OWN_STEP]
     found = {
         "qsgm_step_over_forward": step / turns["forward"],
         "float_step_over_forward": turns["sgm_float"] / turns["forward"],
-        "int8_step_over_float_step": step / turns["sgm_float"],
+        "int8_step_over_forward": turns["sgm_int8"] / turns["forward"],
+        "int8_step_over_float_step": turns["sgm_int8"] / turns["sgm_float"],
         "bp_step_over_qsgm_step": turns["backprop"] / step,
         "qsgm_tuning_over_total": own["tuning"] / own["total"],
     }
@@ -123,10 +129,10 @@ def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | 
 
 
 def peer_ratios(times: StepTimes, threads: int) -> dict[str, float | None]:
-    """Each other framework's step, with SGD in the place of Adam, over the int8 one."""
+    """Each other framework's step, with SGD in the place of Adam, over this one's."""
     steps = times.seconds(threads)
     return {
-        f"{name}_step_over_qsgm_step": number(steps[name] / steps["sgm_int8"], 3)
+        f"{name}_step_over_qsgm_step": number(steps[name] / steps[OWN_STEP], 3)
         for name in steps
         if name not in times.own[threads]
     }
