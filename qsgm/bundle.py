@@ -12,6 +12,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from qsgm import defaults
 from qsgm.angles import ENCODINGS, AngleEncoding
 from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.defaults import MOST_LAYERS
@@ -132,8 +133,13 @@ class Bundle:
                 f"the bundle {self.folder} can tune {self.most_layers} layers at most, not "
                 f"{tuned}; pass --layers {self.most_layers}"
             )
-        whole = {one_block(len(parse_blocks(text).layers)) for text in self.blocks}
-        if str(blocks) not in self.blocks and blocks not in whole:
+        numbers = sorted({len(parse_blocks(text).layers) for text in self.blocks})
+        if tuned not in numbers:
+            raise QsgmError(
+                f"the bundle {self.folder} was made to tune {' or '.join(map(str, numbers))} "
+                f"layers, not {tuned}; pass --layers {numbers[-1]} or another --bundle"
+            )
+        if str(blocks) not in self.blocks and blocks != one_block(tuned):
             raise QsgmError(
                 f"the bundle {self.folder} has no step for the blocks {blocks}; choose one of "
                 f"{' or '.join(self.blocks)}, or export it with `{COMMAND} --blocks {blocks}`"
@@ -154,9 +160,11 @@ class Bundle:
         name: OptimizerName = optimizer or recipes["optimizer"]
         text = str(blocks or default_blocks(method, tuned))
         if text not in recipes["rates"].get(name, {}):
+            other = recipes["optimizer"]
+            advice = f"--optimizer {other}" if name != other else "another --bundle"
             raise QsgmError(
                 f"the bundle {self.folder} has no rates for {name} on the blocks {text}; pass "
-                f"--optimizer {recipes['optimizer']}"
+                f"{advice}"
             )
         gain = recipes["short_gains"][text] if method == "sgm" and name == "sgd" else 1.0
         return Recipe(name, tuple(recipes["rates"][name][text]), gain)
@@ -164,17 +172,20 @@ class Bundle:
     def session(
         self, name: str, threads: int = 1, constants: Mapping[str, NDArray[Any]] | None = None
     ) -> ort.InferenceSession:
-        """An ONNX Runtime session of one of the bundle's graphs.
+        """An ONNX Runtime session of one of the bundle's graphs, see :meth:`graph_path`.
 
-        `constants` take the place of the graph's own, by initializer name. Raises QsgmError where
-        the bundle was made without it.
+        `constants` take the place of the graph's own, by initializer name.
         """
+        return open_session(self.graph_path(name), threads, constants or {})
+
+    def graph_path(self, name: str) -> Path:
+        """The file of a graph. Raises QsgmError where the bundle was made without it."""
         if name not in self.manifest["files"]:
             raise QsgmError(
                 f"the bundle {self.folder} was made without {name}; pass another --bundle, or make "
                 f"a whole one with `{COMMAND}`"
             )
-        return open_session(self.folder / name, threads, constants or {})
+        return self.folder / name
 
     def activation_bits(self, layer: int) -> ActivationBits:
         """Of the int8 SGM behind a layer."""
@@ -245,12 +256,12 @@ def load_bundle(folder: Path) -> Bundle:
 
 
 def needed_files(trunk: Precision, optimizer: OptimizerName, blocks: Sequence[str]) -> set[str]:
-    """The graphs without which a bundle can tune none of its blocks as its recipe says."""
+    """The graphs without which a bundle cannot tune all of its blocks as is usual."""
     needed = {NETWORK, WEIGHTS}
     for one in map(parse_blocks, blocks):
         tuned = len(one.layers)
         needed |= {head_file(tuned), trunk_file(trunk, tuned)}
-        needed.add(step_file("int8", optimizer, one))
+        needed.add(step_file(defaults.PRECISION, optimizer, one))
     return needed
 
 
@@ -264,7 +275,7 @@ def _check_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     for key, (expected, is_sane) in _EXPECTED.items():
         try:
             sane = is_sane(manifest)
-        except (KeyError, TypeError, ValueError, AttributeError, OSError, QsgmError):
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, QsgmError):
             sane = False
         if not sane:
             raise QsgmError(f"{path}: {key!r} is damaged: expected {expected}; run `{COMMAND}`")
@@ -359,10 +370,10 @@ def _are_recipes(manifest: Mapping[str, Any]) -> bool:
         for text, rates in (one for some in recipe["rates"].values() for one in some.items()):
             if len(rates) != len(parse_blocks(text).layers):
                 return False
-            if not all(0 < rate < math.inf for rate in rates):
+            if not all(0 < float(rate) < math.inf for rate in rates):
                 return False
     gains = manifest["recipes"]["sgm"]["short_gains"]
-    return all(1 <= gains[text] < math.inf for text in can_tune["sgm"])
+    return all(1 <= float(gains[text]) < math.inf for text in can_tune["sgm"])
 
 
 # key: (what is expected, whether the manifest has it); in this order

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import onnxruntime as ort
 from numpy.typing import NDArray
 
 from qsgm.blocks import Blocks
@@ -272,13 +273,18 @@ class _GuardedLoop(StepLoop):
         self.kept: dict[int, dict[str, Array]] = {}
         self._look()
 
-    def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
+    def step(
+        self,
+        rows: NDArray[np.int64],
+        factor: float = 1.0,
+        options: ort.RunOptions | None = None,
+    ) -> float:
         features, labels, among = self._batch(rows)
+        if self._prober.wants(self.steps + 1):
+            options = self._before_probe
         with running_graphs(self._bundle):
             self.put(features, labels)
-            before_probe = self._prober.wants(self.steps + 1)
-            self._options = self._before_probe if before_probe else None
-            loss = super().step(among, factor)
+            loss = super().step(among, factor, options)
         self.steps += 1
         self.refuse_unless_finite(bool(np.isfinite(loss)), "the loss")
         self._look()

@@ -19,7 +19,7 @@ class Settings:
     trunk: Precision | None = None  # of the frozen layers
     optimizer: OptimizerName | None = None
     epochs: int = defaults.EPOCHS
-    recalibrate: bool = False  # the int8 SGMs, on this object's crops before the first step
+    recalibrate: bool = False  # int8 SGMs, which it takes, on this object's crops before any step
     stream: bool = False  # make crops and features again for every batch, keep none
     seed: int = 0
     center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre

@@ -34,7 +34,6 @@ class StepLoop:
     ) -> None:
         self._session = session
         self._rates = dict(rates)
-        self._options: ort.RunOptions | None = None  # of the runs to come
         # Kept here, since bindings read these arrays' memory.
         self._data: dict[str, NDArray[Any]] = {
             "features": np.ascontiguousarray(features),
@@ -54,7 +53,12 @@ class StepLoop:
         self._bindings = [self._bind(0, 1), self._bind(1, 0)]
         self._now = 0
 
-    def step(self, rows: NDArray[np.int64], factor: float = 1.0) -> float:
+    def step(
+        self,
+        rows: NDArray[np.int64],
+        factor: float = 1.0,
+        options: ort.RunOptions | None = None,
+    ) -> float:
         """Train on the crops `rows`, all rates times `factor`.
 
         Returns the batch's mean loss before the update.
@@ -63,7 +67,7 @@ class StepLoop:
             self._data[f"rate{layer}"][...] = factor * rate
         binding = self._bindings[self._now]
         binding.bind_cpu_input("rows", rows)
-        self._session.run_with_iobinding(binding, self._options)
+        self._session.run_with_iobinding(binding, options)
         self._now = 1 - self._now
         return float(self._loss)
 

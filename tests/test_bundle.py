@@ -27,7 +27,7 @@ from qsgm.finetuning import finetune
 from qsgm.settings import Settings
 
 BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", "4,5-6", "1-4,5,6"]
-STEP = step_file("int8", "sgd", single_layers(3))
+STEP = step_file("float", "sgd", single_layers(3))
 
 
 def test_a_whole_bundle_loads(bundle: Bundle) -> None:
@@ -198,6 +198,8 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("recipes", "sgm", "optimizer"), "lion", "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "sgd", "4,5,6"), [0.1], "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "adam", "6"), [0.0], "'recipes' is damaged"),
+        (("recipes", "sgm", "rates", "adam", "6"), [10**400], "'recipes' is damaged"),
+        (("recipes", "sgm", "short_gains", "6"), 10**400, "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "adam", "6"), ["fast"], "'recipes' is damaged"),
         (("recipes", "bp", "rates", "adam", "5-6"), [1e-3, float("inf")], "'recipes' is damaged"),
         (("initializers", "bias6"), None, "'initializers' gives None for bias6"),
@@ -231,7 +233,7 @@ def test_a_manifest_that_says_nonsense_is_refused_by_its_key(
         NETWORK,
         head_file(1),
         trunk_file("float", 6),
-        step_file("int8", "sgd", parse_blocks("1-4,5,6")),
+        step_file("float", "sgd", parse_blocks("1-4,5,6")),
     ],
 )
 def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
@@ -250,7 +252,7 @@ def test_a_manifest_that_does_not_list_a_graph_is_refused_by_its_name(
         (trunk_file("float", 3), trunk_file("float", 1)),
         (trunk_file("float", 3), head_file(3)),
         (head_file(3), head_file(1)),
-        (STEP, step_file("int8", "sgd", single_layers(2))),
+        (STEP, step_file("float", "sgd", single_layers(2))),
         (STEP, trunk_file("float", 3)),
         (probe_file(3), head_file(3)),
     ],

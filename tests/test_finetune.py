@@ -145,7 +145,7 @@ def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (Settings(precision="int8", layers=6, epochs=1), {1, 2, 3, 4, 5}),
         (Settings(precision="int8", layers=6, blocks="1-4,5,6", epochs=1), {4, 5}),
-        (Settings(precision="int8", layers=6, method="bp", epochs=1), {1, 2, 3, 4, 5}),
+        (Settings(layers=6, method="bp", epochs=1), {1, 2, 3, 4, 5}),
         (Settings(layers=5, precision="float", epochs=1), {2, 3, 4, 5}),
         (Settings(precision="int8", layers=4, epochs=1), {3, 4, 5}),
         (Settings(precision="int8", layers=3, blocks="4,5-6", epochs=1), {4}),
@@ -211,15 +211,12 @@ def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
 
 
 def test_backpropagation_may_be_asked_for_by_its_one_block(frame: Frame, bundle: Bundle) -> None:
-    asked = finetune(frame, bundle, Settings(precision="int8", method="bp", blocks="4-6", epochs=1))
-    assert (
-        asked.network()
-        == finetune(frame, bundle, Settings(precision="int8", method="bp", epochs=1)).network()
-    )
+    asked = finetune(frame, bundle, Settings(method="bp", blocks="4-6", epochs=1))
+    assert asked.network() == finetune(frame, bundle, Settings(method="bp", epochs=1)).network()
 
 
 def test_backpropagation_lowers_the_loss(frame: Frame, bundle: Bundle) -> None:
-    result = finetune(frame, bundle, Settings(precision="int8", method="bp", epochs=6))
+    result = finetune(frame, bundle, Settings(method="bp", epochs=6))
     assert result.losses[-1] < 0.9 * result.losses[0]
     assert result.accuracy.detection_accuracy > result.zero_shot.detection_accuracy
 
@@ -296,11 +293,11 @@ def test_streamed_features_give_the_same_run_as_kept_ones(
 
 
 @pytest.mark.usefixtures("few_crops")
-@pytest.mark.parametrize("layers", [4, 5, 6])
+@pytest.mark.parametrize(("layers", "precision"), [(4, "int8"), (5, "float"), (6, "int8")])
 def test_streamed_maps_give_the_same_run_as_kept_ones(
-    frame: Frame, bundle: Bundle, layers: int
+    frame: Frame, bundle: Bundle, layers: int, precision: Precision
 ) -> None:
-    settings = Settings(precision="int8", layers=layers, epochs=1)
+    settings = Settings(precision=precision, layers=layers, epochs=1)
     streamed = finetune(frame, bundle, replace(settings, stream=True))
     assert_same_run(streamed, finetune(frame, bundle, settings))
 

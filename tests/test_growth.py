@@ -15,6 +15,7 @@ from onnx import ModelProto, TensorProto
 from rich.console import Console
 
 from qsgm import cli
+from qsgm.bench import step_jobs
 from qsgm.bench.frames import list_frames
 from qsgm.bench.growth import (
     ALONE,
@@ -42,7 +43,7 @@ from qsgm.runtime import session_options
 from qsgm.train import growth
 from qsgm.train.graphs.inspection import integer_operators, refuse_float_products
 from qsgm.train.graphs.trunk import int8_trunk_model
-from qsgm.train.growth import Sizes, measure_growth, median_seconds
+from qsgm.train.growth import Sizes, measure_growth
 from qsgm.train.growth_chart import growth_chart, time_ticks, write_growth_chart
 from qsgm.train.growth_jobs import sgm_jobs, trunk_jobs, wide_jobs, wide_steps, with_s8_weights
 from qsgm.train.wide import quantized, random_net, random_sgm, sgm_model, wide_net, wide_sgms
@@ -92,10 +93,12 @@ def test_every_series_holds_every_size_and_variant(report: GrowthReport) -> None
 
 
 def test_layers_that_a_bundle_cannot_tune_are_left_out(bundle: Bundle, frames_folder: Path) -> None:
-    few = replace(bundle, manifest=bundle.manifest | {"most_layers": 2})
+    sgms = {layer: bundle.manifest["sgms"][layer] for layer in ("4", "5")}
+    few = replace(bundle, manifest=bundle.manifest | {"most_layers": 3, "sgms": sgms})
     sizes = replace(SMALL(repeats=1), widths=(1,), crops=(20,))
     found = measure_growth(list_frames(frames_folder, 1)[0], few, 1, sizes, lambda *_: None)
-    assert set(found.layers) == {1, 2}
+    assert set(found.layers) == {1, 2, 3}
+    assert set(found.sgms) == {1}  # the 3x3 one is behind layer 3
 
 
 def test_variants_take_turns_and_the_first_turn_does_not_count(
@@ -108,9 +111,9 @@ def test_variants_take_turns_and_the_first_turn_does_not_count(
         clock[0] += seconds[calls.count(name)]
         calls.append(name)
 
-    monkeypatch.setattr(growth.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(step_jobs.time, "perf_counter", lambda: clock[0])
     jobs = {"a": partial(job, "a", [900, 1, 5, 2]), "b": partial(job, "b", [0, 7, 8, 9])}
-    assert median_seconds(jobs, 3) == {"a": 2, "b": 8}
+    assert step_jobs.median_seconds(jobs, 3) == {"a": 2, "b": 8}
     assert calls == ["a", "b"] * 4
 
 

@@ -1,6 +1,7 @@
 """A slim bundle: less of the whole one, and every number the same."""
 
 import json
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from qsgm import QsgmError, Settings, finetune, load_bundle
+from qsgm.bench.speed import measure_speed
 from qsgm.bench.step_jobs import random_features, start_of
-from qsgm.blocks import parse_blocks
-from qsgm.bundle import Bundle, step_file
+from qsgm.blocks import one_block, parse_blocks, single_layers
+from qsgm.bundle import Bundle, probe_file, step_file
 from qsgm.train.graphs.inspection import all_nodes
+from qsgm.train.liveness import step_memory
 from qsgm.train.slim import slim_bundle
 
 Frame = NDArray[np.uint8]
@@ -32,7 +35,7 @@ def slim(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     [
         Settings(precision="int8", epochs=1),
         Settings(epochs=1, precision="float"),
-        Settings(precision="int8", epochs=1, method="bp"),
+        Settings(epochs=1, method="bp"),
         Settings(precision="int8", epochs=1, recalibrate=True),
     ],
 )
@@ -53,14 +56,13 @@ def test_tuning_with_it_gives_the_same_bits(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
+        (Settings(layers=2), "was made to tune 3 layers, not 2; pass --layers 3 or another"),
+        (Settings(layers=1, method="bp"), "was made to tune 3 layers, not 1"),
+        (Settings(layers=6), "can tune 3 layers at most"),
+        (Settings(blocks="4,5-6"), "has no step for the blocks 4,5-6; choose one of 4,5,6"),
+        (Settings(optimizer="adam"), "has no rates for adam on the blocks 4,5,6"),
         (
-            Settings(precision="int8", layers=2),
-            "has no step for the blocks 5,6; choose one of 4,5,6",
-        ),
-        (Settings(precision="int8", layers=6), "can tune 3 layers at most"),
-        (Settings(precision="int8", optimizer="adam"), "has no rates for adam on the blocks 4,5,6"),
-        (
-            Settings(precision="int8", trunk="int8"),
+            Settings(trunk="int8"),
             "was made without trunk_int8_3.onnx; pass another --bundle",
         ),
     ],
@@ -90,7 +92,8 @@ def test_graphs_with_loops_keep_their_arithmetic(bundle: Bundle, tmp_path: Path)
     results = {value.name for value in graph.output}
     made = {value for node in all_nodes(graph) for value in node.output} - results
     assert max(map(len, made)) == 2
-    assert {node.name for node in all_nodes(graph)} == {""}
+    names = [node.name for node in all_nodes(graph)]
+    assert len(set(names)) == len(names)
 
 
 def test_the_report_adds_up_and_fits_a_line(bundle: Bundle, tmp_path: Path) -> None:
@@ -106,10 +109,58 @@ def test_the_report_adds_up_and_fits_a_line(bundle: Bundle, tmp_path: Path) -> N
     assert shown.getvalue().endswith(f"{values['bundle_bytes'] / 1000:.0f} KB\n")
 
 
+@pytest.mark.parametrize("text", ["6", "4,5,6", "4,5-6", "1-4,5,6"])
+def test_what_is_slim_already_stays_as_it_is(bundle: Bundle, tmp_path: Path, text: str) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    slim_bundle(bundle, parse_blocks(text), first)
+    slim_bundle(load_bundle(first), parse_blocks(text), second)
+    for path in first.iterdir():
+        assert (second / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_a_bundle_may_lack_the_probe_and_nothing_else(bundle: Bundle, tmp_path: Path) -> None:
+    blocks = parse_blocks("5,6")
+    files = bundle.manifest["files"]
+    without = {name: one for name, one in files.items() if name != probe_file(2)}
+    report = slim_bundle(
+        replace(bundle, manifest=bundle.manifest | {"files": without}), blocks, tmp_path / "two"
+    )
+    assert probe_file(2) not in report.bytes
+    step = step_file("float", "sgd", blocks)
+    without = {name: one for name, one in files.items() if name != step}
+    with pytest.raises(QsgmError, match=f"was made without {step}"):
+        slim_bundle(
+            replace(bundle, manifest=bundle.manifest | {"files": without}), blocks, tmp_path / "no"
+        )
+
+
+def test_memory_and_speed_of_a_slim_bundle_are_refused_before_any_work(
+    slim: Bundle, frame_path: Path
+) -> None:
+    with pytest.raises(QsgmError, match=r"was made without step_float_sgd_4-6\.onnx"):
+        measure_speed(frame_path, slim, Settings(), 1, pytest.fail)
+    with pytest.raises(QsgmError, match=r"was made without step_float_sgd_4-6\.onnx"):
+        step_memory(slim, "float", one_block(3), 2)
+    assert step_memory(slim, "int8", single_layers(3), 2).peak > 0
+
+
+def test_a_bundle_is_not_replaced_by_a_part_of_it(slim: Bundle) -> None:
+    with pytest.raises(QsgmError, match="is the bundle itself"):
+        slim_bundle(slim, parse_blocks("4,5,6"), slim.folder)
+    assert load_bundle(slim.folder).manifest == slim.manifest
+
+
+@pytest.mark.parametrize("text", ["4-6", "3,4-5,6"])
+def test_blocks_without_sgms_in_the_bundle_are_refused(
+    bundle: Bundle, tmp_path: Path, text: str
+) -> None:
+    with pytest.raises(QsgmError, match=f"has no SGMs for the blocks {text}; choose one of 6 or"):
+        slim_bundle(bundle, parse_blocks(text), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_with_something_else_is_refused(bundle: Bundle, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(QsgmError, match="did not write"):
         slim_bundle(bundle, parse_blocks("5,6"), tmp_path)
-    with pytest.raises(QsgmError, match="has no step for the blocks 3,4-5,6"):
-        slim_bundle(bundle, parse_blocks("3,4-5,6"), tmp_path / "new")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]

@@ -30,6 +30,7 @@ from qsgm.bench.peers_table import (
     render_steps,
     steps_json,
 )
+from qsgm.bench.step_jobs import check_steps
 from qsgm.bundle import Bundle
 from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
@@ -61,6 +62,7 @@ def measure_speed(
 
     `plan` says which other frameworks' steps to measure; without one, none.
     """
+    check_steps(bundle, settings.layers)
     medians = measure_jobs(frame, bundle, settings, repeats, watch)
     times = measure_steps(frame, bundle, settings.layers, settings.threads, repeats, plan, watch)
     steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
@@ -129,7 +131,7 @@ def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | 
 
 
 def peer_ratios(times: StepTimes, threads: int) -> dict[str, float | None]:
-    """Each other framework's step, with SGD in the place of Adam, over this one's."""
+    """Each other framework's step over this one's, all of SGD."""
     steps = times.seconds(threads)
     return {
         f"{name}_step_over_qsgm_step": number(steps[name] / steps[OWN_STEP], 3)

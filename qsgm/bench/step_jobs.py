@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from qsgm.blocks import Blocks, one_block, single_layers
-from qsgm.bundle import Bundle, Precision, head_file, step_file
+from qsgm.bundle import PRECISIONS, Bundle, Precision, head_file, step_file
 from qsgm.preparing import running_graphs
 from qsgm.tuning import BATCH, StepLoop
 from qsgm.weights import to_step_layout
@@ -22,15 +22,28 @@ def step_seconds(bundle: Bundle, tuned: int, repeats: int, threads: int) -> dict
         "sgm_float": step_job(bundle, "float", single_layers(tuned), threads),
         "sgm_int8": step_job(bundle, "int8", single_layers(tuned), threads),
     }
-    times: dict[str, list[float]] = {name: [] for name in jobs}
     with running_graphs(bundle):
-        for turn in range(-1, repeats):  # the first turn allocates and does not count
-            for name, job in jobs.items():
-                began = time.perf_counter()
-                job()
-                if turn >= 0:
-                    times[name].append(time.perf_counter() - began)
+        return median_seconds(jobs, repeats)
+
+
+def median_seconds(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Of each job; they take turns."""
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn in range(-1, repeats):  # the first turn allocates and does not count
+        for name, job in jobs.items():
+            began = time.perf_counter()
+            job()
+            if turn >= 0:
+                times[name].append(time.perf_counter() - began)
     return {name: median(some) for name, some in times.items()}
+
+
+def check_steps(bundle: Bundle, tuned: int) -> None:
+    """Raise QsgmError unless the bundle has what :func:`step_seconds` opens."""
+    for precision in PRECISIONS:
+        bundle.graph_path(step_file(precision, "sgd", single_layers(tuned)))
+    for name in (head_file(tuned), step_file("float", "sgd", one_block(tuned))):
+        bundle.graph_path(name)
 
 
 def forward_pass(bundle: Bundle, tuned: int, threads: int) -> Callable[[], object]:

@@ -191,10 +191,11 @@ def finetune(
     from qsgm.tuned import DESCRIPTION
 
     tuned = tuned_layers(layers, blocks)
-    wanted = recalibrate if int8 is None else int8  # it is int8 SGMs that are calibrated
     settings = settings_of(
-        wanted, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
+        int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
     )
+    if recalibrate and int8 is None and settings.method == "sgm":
+        settings = replace(settings, precision="int8")  # those are the SGMs that have ranges
     settings = replace(settings, recalibrate=recalibrate, stream=stream)
     folder = paths.object_folder(frame) if output is None else output
     check_replaceable(folder, DESCRIPTION)

@@ -106,9 +106,8 @@ StreamOption = Annotated[
     bool,
     typer.Option(
         "--stream",
-        help="Keep no crops' features: make them again for every batch. In memory that saves "
-        "nothing up to 4 layers, 20 MB with 5 and 46 MB with 6; in time it costs a quarter of a "
-        "second an epoch.",
+        help="Keep no crops' features, make them again for every batch: less memory with 5 or 6 "
+        "layers, and longer.",
     ),
 ]
 OptimizerOption = Annotated[

@@ -225,7 +225,7 @@ is in them. Batchnorm is folded into the convolutions (largest change of any out
 | `weights.bin` | constants of all other graphs, which open with it beside them only |
 | `trunk_P_N.onnx` | crops to u8 features when the last N layers are tuned, the others in P |
 | `head_N.onnx` | features to outputs |
-| `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step, SGD or Adam; B: layers in blocks |
+| `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step; B: layers in blocks |
 | `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
 | `probe_N.onnx` | int8, float and true gradients of a batch, and the updates they lead to |
 

@@ -7,7 +7,7 @@ kept.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from qsgm import defaults
 from qsgm.bench.frames import BenchFrame
 from qsgm.bench.growth import CROPS, FEATURES, GrowthReport, Series
-from qsgm.bench.step_jobs import start_of
+from qsgm.bench.step_jobs import median_seconds, start_of
 from qsgm.bundle import Bundle, step_file
 from qsgm.crops import CROPS as USUAL_CROPS
 from qsgm.crops import TRAIN_CROPS, label_crops, plan_crops
@@ -26,7 +26,6 @@ from qsgm.settings import Settings
 from qsgm.train.growth_jobs import (
     METHODS,
     TUNED,
-    Job,
     Jobs,
     bundle_jobs,
     sgm_jobs,
@@ -90,7 +89,11 @@ def measure_growth(
             series("width", sizes.widths, lambda size: wide_jobs(bundle, size, threads)),
             crops_series(frame, bundle, threads, sizes, watch),
             series("trunk", sizes.widths, lambda size: trunk_jobs(size, threads)),
-            {kernel: sgms(kernel, layer) for kernel, layer in LAYER_BEFORE.items()},
+            {
+                kernel: sgms(kernel, layer)
+                for kernel, layer in LAYER_BEFORE.items()
+                if str(layer) in bundle.manifest["sgms"]
+            },
         )
 
 
@@ -103,18 +106,6 @@ def timed(
         series[size] = median_seconds(jobs(size), repeats)
         watch(stage, done, len(sizes))
     return series
-
-
-def median_seconds(jobs: Mapping[str, Job], repeats: int) -> dict[str, float]:
-    """Of each job; they take turns."""
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for turn in range(-1, repeats):  # the first turn allocates and does not count
-        for name, job in jobs.items():
-            began = time.perf_counter()
-            job()
-            if turn >= 0:
-                times[name].append(time.perf_counter() - began)
-    return {name: median(some) for name, some in times.items()}
 
 
 def crops_series(

@@ -96,7 +96,7 @@ def step_memory(
             step()
             step()
 
-    trace = traced(bundle.folder / step_file(precision, "sgd", blocks), two_steps, threads)
+    trace = traced(bundle.graph_path(step_file(precision, "sgd", blocks)), two_steps, threads)
     peak = live_peak(trace.nodes, trace.bound)
     before = trace.before
     asked = None if before is None else [most - before for most in trace.in_use]

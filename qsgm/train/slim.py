@@ -2,7 +2,8 @@
 
 What stays is what `qsgm finetune` opens for these blocks with the bundle's own optimizers and its
 own precision of the frozen layers: the step with SGMs in int8 and in float, backpropagation, and
-the probe, by which a run says how faithful its gradients are. No number changes.
+the probe, by which a run says how faithful its gradients are. No number changes. `qsgm bench` of
+speed, memory, resources and growth compares steps that only a whole bundle has.
 """
 
 import hashlib
@@ -26,6 +27,7 @@ from qsgm.bundle import (
     step_file,
     trunk_file,
 )
+from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
 from qsgm.train.graphs.short_names import shorten
@@ -66,12 +68,19 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
         output: absent, empty, or an earlier bundle.
 
     Raises:
-        QsgmError: the bundle lacks the blocks, or the output folder holds something else.
+        QsgmError: the bundle lacks the blocks, or the output folder is the bundle's own or holds
+            something else.
     """
     check_replaceable(output, WEIGHTS)
-    bundle.check_blocks(blocks)
+    if output.resolve() == bundle.folder.resolve():
+        raise QsgmError(f"{output} is the bundle itself; pass another folder to -o")
+    if str(blocks) not in bundle.blocks:
+        raise QsgmError(
+            f"the bundle {bundle.folder} has no SGMs for the blocks {blocks}; choose one of "
+            f"{' or '.join(bundle.blocks)}"
+        )
     network = (bundle.folder / NETWORK).read_bytes()
-    graphs = {name: onnx.load(bundle.folder / name) for name in kept_graphs(bundle, blocks)}
+    graphs = {name: onnx.load(bundle.graph_path(name)) for name in kept_graphs(bundle, blocks)}
     shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
     sgms = kept_sgms(bundle, blocks, shared)
     shared.take_from(graphs.values())
@@ -94,13 +103,13 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
 
 
 def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
-    """Names of the graphs that tuning these blocks opens."""
-    tuned = len(blocks.layers)
-    sgm, bp = (bundle.recipe(method, tuned, None).optimizer for method in ("sgm", "bp"))
+    """Names of the graphs that tuning these blocks opens; a bundle may do without the probe."""
+    tuned, recipes = len(blocks.layers), bundle.manifest["recipes"]
+    sgm, bp = (recipes[method]["optimizer"] for method in ("sgm", "bp"))
     steps = [step_file(precision, sgm, blocks) for precision in PRECISIONS]
     names = [head_file(tuned), trunk_file(bundle.trunk, tuned), *steps]
     names.append(step_file("float", bp, one_block(tuned)))
-    if blocks.sgm_layers:
+    if probe_file(tuned) in bundle.manifest["files"]:
         names.append(probe_file(tuned))
     return list(dict.fromkeys(names))
 

@@ -119,9 +119,12 @@ def random_sgm(layer: int, channels: int, hidden: Sequence[int]) -> FoldedSgm:
 def random_curvature(net: FoldedNet, layer: int) -> Curvature:
     """Of the right sides for a layer: it bends as many numbers as a meta-learned one."""
     out, into, kernel, _ = net.layers[layer - 1].weight.shape
-    torch.manual_seed(SEED)
-    sides = kernel**2, into, out, out
-    return Curvature(*(torch.eye(side) + 0.01 * torch.randn(side, side) for side in sides))
+    generator = torch.Generator().manual_seed(SEED)
+    matrices = (
+        torch.eye(side) + 0.01 * torch.randn(side, side, generator=generator)
+        for side in (kernel**2, into, out, out)
+    )
+    return Curvature(*matrices)
 
 
 def quantized(sgm: FoldedSgm, bits: ActivationBits) -> QuantizedSgm:

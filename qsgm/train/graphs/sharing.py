@@ -16,8 +16,9 @@ from qsgm.train.graphs.trunk import initializer_offsets
 
 # Smaller constants stay in the graph: naming the place of another takes as many bytes.
 LEAST_BYTES = 200
-# Of every constant's place, so that a runtime may map it into memory.
-ALIGNMENT = 64
+# Of every constant's place, so that a runtime may map it into memory; in another file as much as a
+# number takes has to do.
+ALIGNMENT, LEAST_ALIGNMENT = 64, 4
 # So begin the names of constants that the device exchanges, which goes with external ones only.
 EXCHANGED = "sgm"
 
@@ -31,9 +32,9 @@ class OtherFile:
     places: Mapping[str, tuple[int, int]]  # offset and bytes of each
 
     def offset_of(self, raw: bytes) -> int | None:
-        """Where these bytes lie in the file, as a constant of their own."""
+        """Where these bytes lie in the file, as a constant of their own, if that is aligned."""
         for offset, length in self.places.values():
-            if self.data[offset : offset + length] == raw:
+            if offset % LEAST_ALIGNMENT == 0 and self.data[offset : offset + length] == raw:
                 return offset
         return None
 

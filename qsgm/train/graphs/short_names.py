@@ -14,7 +14,7 @@ from qsgm.train.graphs.sharing import EXCHANGED
 
 
 def shorten(model: onnx.ModelProto) -> None:
-    """Rename all other values and take the nodes' names away; the model is changed."""
+    """Rename all other values, and nodes by what they make; the model is changed."""
     graph = model.graph
     kept = {value.name for value in (*graph.input, *graph.output)}
     kept |= {one.name for one in graph.initializer if one.name.startswith(EXCHANGED)}
@@ -43,13 +43,13 @@ def values_of(graph: onnx.GraphProto) -> Iterator[str]:
 
 
 def rename(graph: onnx.GraphProto, names: dict[str, str]) -> None:
-    """Give every value of a graph and of the loops in it its new name, and no name to a node."""
+    """Give every value of a graph and of the loops in it its new name, and nodes their first's."""
     graph.name = "g"
     for value in (*graph.input, *graph.output, *graph.initializer):
         value.name = names[value.name]
     for node in graph.node:
-        node.name = ""
         node.input[:] = [names[value] for value in node.input]
         node.output[:] = [names[value] for value in node.output]
+        node.name = node.output[0]
         for body in bodies(node):
             rename(body, names)
