@@ -24,10 +24,11 @@ from qsgm.train.graphs.optimizers import Gradient, value_of
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
-# Numbers in the windows of one crop, above which a block with an SGM goes crop by crop. Layers 1
-# and 2 are quicker so; layer 3, the smallest above, adds a tenth to a step of four layers, which
-# then takes a quarter of the memory; layer 4, below, would take longer for calls than for its work.
-MANY_NUMBERS = 30_000
+# Windows of one crop, above which a block with an SGM goes crop by crop. Layers 1 and 2 are quicker
+# so; layer 3, with 169, adds a tenth to a step of four layers, which then takes a quarter of the
+# memory. Layer 4 has 25, and as a product has no fewer weights for having few windows, it would take
+# half as long again.
+MANY_WINDOWS = 100
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
 
@@ -77,7 +78,7 @@ class TunedLayer:
     @property
     def many_windows(self) -> bool:
         """Whether the windows of a batch are too many to be in memory at once."""
-        return self.positions * self.width > MANY_NUMBERS
+        return self.positions > MANY_WINDOWS
 
     @property
     def into(self) -> int:
