@@ -26,8 +26,8 @@ from qsgm.weights import to_step_layout
 CROP_SIDE = 128
 # Windows of one crop, above which a block with an SGM goes crop by crop. Layers 1 and 2 are quicker
 # so; layer 3, with 169, adds a tenth to a step of four layers, which then takes a quarter of the
-# memory. Layer 4 has 25, and as a product has no fewer weights for having few windows, it would take
-# half as long again.
+# memory. Layer 4 has 25, and a crop's product reads all weights anew: a step of three layers would
+# take twice as long.
 MANY_WINDOWS = 100
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
