@@ -187,6 +187,14 @@ class Bundle:
             )
         return self.folder / name
 
+    def peak_activation_bytes(self, name: str) -> int | None:
+        """Bytes of activations alive at once in a training step of 32 crops, by its graph's name.
+
+        None where the manifest does not say.
+        """
+        found = self.manifest["files"].get(name, {}).get("peak_activation_bytes")
+        return found if type(found) is int else None
+
     def activation_bits(self, layer: int) -> ActivationBits:
         """Of the int8 SGM behind a layer."""
         bits: ActivationBits = self.manifest["sgms"][str(layer)]["bits"]

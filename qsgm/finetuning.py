@@ -17,7 +17,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from qsgm.blocks import Blocks
+from qsgm.blocks import Blocks, one_block
 from qsgm.bundle import Bundle, Precision, Recipe, step_file
 from qsgm.crops import TRAIN_CROPS
 from qsgm.drift import drift_warnings
@@ -45,18 +45,8 @@ from qsgm.settings import (
     trunk_precision,
 )
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
-from qsgm.tuning import BATCH, StepLoop, tune
+from qsgm.tuning import StepLoop, tune
 from qsgm.weights import to_conv_layout
-
-# What each layer leaves per crop: convolution and ReLU, and the pool's one position.
-OUTPUTS_PER_CROP = {
-    1: 8 * 2 * 62**2,
-    2: 8 * 2 * 29**2,
-    3: 16 * 2 * 13**2,
-    4: 16 * (2 * 5**2 + 1),
-    5: 16 * 2,
-    6: 3,
-}
 
 
 @dataclass(frozen=True)
@@ -105,9 +95,10 @@ class FinetuneResult:
         return run_blocks(self.settings)
 
     @property
-    def peak_activation_bytes(self) -> dict[str, int]:
-        """Layer outputs that have to be alive at once; see :func:`peak_activation_bytes`."""
-        return peak_activation_bytes(sgm_blocks(self.settings))
+    def peak_activation_bytes(self) -> dict[str, int | None]:
+        """Of a step, with SGMs and by backpropagation; see :func:`peak_activation_bytes`."""
+        settings = self.settings
+        return peak_activation_bytes(self.prepared.bundle, settings.precision, sgm_blocks(settings))
 
     def network(self) -> bytes:
         """The tuned network as an ONNX file: a frame in, its heatmap out."""
@@ -231,17 +222,21 @@ def _run_epochs(
     return losses, time.perf_counter() - began - (prober.seconds - probing)
 
 
-def peak_activation_bytes(blocks: Blocks, batch: int = BATCH) -> dict[str, int]:
-    """Bytes of layer outputs that have to be alive at once while these layers are trained.
+def peak_activation_bytes(
+    bundle: Bundle, precision: Precision, blocks: Blocks
+) -> dict[str, int | None]:
+    """Bytes of activations alive at once in a step of 32 crops, with SGMs and by backpropagation.
 
-    Counted in float32: a layer's convolution, ReLU and pool (its batchnorm is folded here), which
-    is how the paper's Table 3 counts layers 4 and 5; of layers 1 to 3 it counts one tensor.
-    Backpropagation keeps those of all layers for the way back. With SGMs a block is done before
-    the next one runs, so it is the largest block's. Windows, weights and features are not counted,
-    both methods need them; nor is what SGMs and gradients take on the way.
+    Reckoned from the graphs when they were exported (:mod:`qsgm.train.liveness`): weights, states,
+    inputs and outputs do not count. None: the bundle does not say.
     """
-    outputs = [sum(4 * batch * OUTPUTS_PER_CROP[k] for k in block) for block in blocks.groups]
-    return {"sgm": max(outputs), "backprop": sum(outputs)}
+    whole = one_block(len(blocks.layers))
+    recipes = bundle.manifest["recipes"]
+    names = {
+        "sgm": step_file(precision, recipes["sgm"]["optimizer"], blocks),
+        "backprop": step_file("float", recipes["bp"]["optimizer"], whole),
+    }
+    return {method: bundle.peak_activation_bytes(name) for method, name in names.items()}
 
 
 class _GuardedLoop(StepLoop):

@@ -24,9 +24,10 @@ from qsgm.train.export_report import ExportReport
 from qsgm.train.fold import fold_net
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.liveness import step_memory
 from qsgm.train.sgm import Sgm
 from qsgm.tuned import ObjectDescription, save_object
-from qsgm.tuning import StepLoop
+from qsgm.tuning import BATCH, StepLoop
 from qsgm.weights import to_step_layout
 
 RATES = {"6": (4e-3,), "5,6": (2e-3, 3e-3), "4,5,6": (1e-3, 2e-3, 3e-3)}
@@ -111,8 +112,16 @@ def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
     others = {"manifest.json", "README.md", "SHA256SUMS"}
     assert {path.name for path in bundle.folder.iterdir()} == {*GRAPHS, "weights.bin"} | others
     for name in GRAPHS:
-        assert bundle.manifest["files"][name]["bytes"] == (bundle.folder / name).stat().st_size
+        entry = bundle.manifest["files"][name]
+        assert entry["bytes"] == (bundle.folder / name).stat().st_size
+        assert ("peak_activation_bytes" in entry) == name.startswith("step")
         onnx.checker.check_model(onnx.load(bundle.folder / name), full_check=True)
+
+
+def test_the_manifest_says_what_memory_steps_take(bundle: Bundle) -> None:
+    blocks = parse_blocks("4,5,6")
+    expected = step_memory(bundle, "int8", blocks, BATCH).peak
+    assert bundle.peak_activation_bytes("step_int8_sgd_4,5,6.onnx") == expected > 0
 
 
 def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:

@@ -398,21 +398,17 @@ def test_a_run_in_float_never_warns_of_drift(frame: Frame, bundle: Bundle) -> No
     assert train(prepared, in_float, exchanged=narrow).warnings == ()
 
 
-def test_activations_are_counted_as_documented() -> None:
-    maps = [8 * 62 * 62, 8 * 29 * 29, 16 * 13 * 13, 16 * 5 * 5, 16, 0]
-    pooled = [0, 0, 0, 16, 0, 3]
-    layers = [4 * 32 * (2 * one + rest) for one, rest in zip(maps, pooled, strict=True)]
-
-    def peak(text: str) -> list[int]:
-        values = peak_activation_bytes(parse_blocks(text))
-        return [values["sgm"], values["backprop"]]
-
-    assert peak("6") == [layers[5], layers[5]]
-    assert peak("4,5,6") == [layers[3], sum(layers[3:])]
-    assert peak("4-5,6") == [sum(layers[3:5]), sum(layers[3:])]
-    assert peak("1,2,3,4,5,6") == [layers[0], sum(layers)]
-    assert peak("2-4,5,6") == [sum(layers[1:4]), sum(layers[1:])]
-    assert peak("1-6") == [sum(layers), sum(layers)]
+def test_a_run_says_what_memory_its_steps_take_where_the_bundle_does(bundle: Bundle) -> None:
+    assert peak_activation_bytes(bundle, "int8", parse_blocks("4,5,6")) == {
+        "sgm": None,
+        "backprop": None,
+    }
+    sizes = {"step_int8_sgd_4,5-6.onnx": 7, "step_float_adam_4-6.onnx": 9, "head_3.onnx": "much"}
+    files = {name: {"peak_activation_bytes": size} for name, size in sizes.items()}
+    told = replace(bundle, manifest=bundle.manifest | {"files": files})
+    found = peak_activation_bytes(told, "int8", parse_blocks("4,5-6"))
+    assert found == {"sgm": 7, "backprop": 9}
+    assert told.peak_activation_bytes("head_3.onnx") is None
 
 
 def test_int8_and_float_sgms_run_different_graphs(frame: Frame, bundle: Bundle) -> None:

@@ -22,9 +22,9 @@ from qsgm.bench.resources import (
     measure_resources,
     step_cost,
 )
-from qsgm.bench.shapes import STRIDES, layer_shapes
+from qsgm.bench.shapes import STRIDES, layer_shapes, output_bytes
 from qsgm.bench.step_jobs import step_job
-from qsgm.blocks import single_layers
+from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle
 from qsgm.folded import FoldedConv, FoldedSgm, float_trace
 from qsgm.quantize import ActivationBits, SgmRanges, constants, quantize_sgm
@@ -196,3 +196,20 @@ def test_the_tables_fit_into_80_columns(report: ResourcesReport) -> None:
     assert "1  153,600,000  153,600,000      624      624    1,968,128  1,968,128" in "\n".join(
         lines
     )
+
+
+def test_outputs_are_counted_as_documented() -> None:
+    maps = [8 * 62 * 62, 8 * 29 * 29, 16 * 13 * 13, 16 * 5 * 5, 16, 0]
+    pooled = [0, 0, 0, 16, 0, 3]
+    layers = [4 * 32 * (2 * one + rest) for one, rest in zip(maps, pooled, strict=True)]
+
+    def peak(text: str) -> list[int]:
+        values = output_bytes(parse_blocks(text))
+        return [values["sgm"], values["backprop"]]
+
+    assert peak("6") == [layers[5], layers[5]]
+    assert peak("4,5,6") == [layers[3], sum(layers[3:])]
+    assert peak("4-5,6") == [sum(layers[3:5]), sum(layers[3:])]
+    assert peak("1,2,3,4,5,6") == [layers[0], sum(layers)]
+    assert peak("2-4,5,6") == [sum(layers[1:4]), sum(layers[1:])]
+    assert peak("1-6") == [sum(layers), sum(layers)]

@@ -54,7 +54,9 @@ class LayersReport:
                 }
                 | {
                     "tuning_s": number(float(np.median(self.seconds[i])), 3),
-                    "peak_activation_bytes": peak_activation_bytes(parse_blocks(text)),
+                    "peak_activation_bytes": peak_activation_bytes(
+                        self.bundle, self.settings.precision, parse_blocks(text)
+                    ),
                     "per_frame": self.results[i].round(4).tolist(),
                 }
                 for i, text in enumerate(self.blocks)

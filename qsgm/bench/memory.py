@@ -19,11 +19,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from qsgm.bench.shapes import output_bytes
 from qsgm.bench.speed import TORCH, VARIANTS, run_once
 from qsgm.bench.tables import right_table
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import MANIFEST, Bundle, Precision, probe_file
-from qsgm.finetuning import peak_activation_bytes
 from qsgm.preparing import Watch
 from qsgm.report import number, plain_table
 from qsgm.settings import Settings, trunk_precision
@@ -217,7 +217,7 @@ def ratio(steps: Steps, name: str) -> float:
 
 def outputs_alone(tuned: int) -> float:
     """All layers' outputs over the largest layer's."""
-    outputs = peak_activation_bytes(single_layers(tuned))
+    outputs = output_bytes(single_layers(tuned))
     return outputs["backprop"] / outputs["sgm"]
 
 

@@ -18,12 +18,11 @@ from qsgm.bench.paper_table import (
     paper_sgm_table,
     paper_table,
 )
-from qsgm.bench.shapes import Shape, layer_shapes
+from qsgm.bench.shapes import OUTPUTS_PER_CROP, Shape, layer_shapes
 from qsgm.bench.step_jobs import step_seconds
 from qsgm.bench.tables import right_table
 from qsgm.blocks import LAYERS
 from qsgm.bundle import FLOAT_BYTES, Bundle
-from qsgm.finetuning import OUTPUTS_PER_CROP
 from qsgm.folded import FoldedSgm
 from qsgm.preparing import Watch
 from qsgm.quantize import ActivationBits

@@ -24,6 +24,7 @@ from qsgm.bundle import (
     PRECISIONS,
     VERSION,
     WEIGHTS,
+    Bundle,
     OptimizerName,
     Precision,
     head_file,
@@ -55,9 +56,11 @@ from qsgm.train.graphs.trunk import (
     trunk_model,
 )
 from qsgm.train.graspnet import normalize
+from qsgm.train.liveness import graph_memory
 from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
 from qsgm.train.sgm_fidelity import measure
 from qsgm.train.trunk_ranges import observe_trunk
+from qsgm.tuning import BATCH
 
 SEED = 0
 # Of the frozen layers, unless the user says otherwise: in int8 they take longer (README).
@@ -124,12 +127,33 @@ def fold_and_quantize(
     size = sum(len(data) for data in files.values())
     report = ExportReport(str(output_folder), layers, calibration, fold_error, size)
     description = describe(trainee, exported, files) | {"sgms": sgms}
-    files[MANIFEST] = (json.dumps(description, indent=1, sort_keys=True) + "\n").encode()
     files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, frames)).encode()
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
+        add_peaks(Bundle(new, description), exported, watch)
+        text = json.dumps(description, indent=1, sort_keys=True) + "\n"
+        (new / MANIFEST).write_text(text, encoding="utf-8")
     return report
+
+
+def add_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Watch) -> None:
+    """Say in the manifest how many bytes of activations each training step holds at once."""
+    steps = {
+        step_file(precision, optimizer, one): one
+        for one in every_block(bundle.most_layers, blocks)
+        for precision in PRECISIONS
+        for optimizer in optimizers_of(one)
+    }
+    for done, (name, one) in enumerate(steps.items(), start=1):
+        peak = graph_memory(bundle, name, one, BATCH).peak
+        bundle.manifest["files"][name]["peak_activation_bytes"] = peak
+        watch("memory", done, len(steps))
+
+
+def every_block(most_layers: int, blocks: Sequence[Blocks]) -> list[Blocks]:
+    """Those with SGMs, and all layers as one block for every number of them."""
+    return list(dict.fromkeys([*blocks, *map(one_block, range(1, most_layers + 1))]))
 
 
 def provenance(path: Path, trainee: Trainee, frames: CalibrationSet) -> Provenance:
@@ -216,7 +240,7 @@ def build_graphs(
         graphs[head_file(tuned)] = head_model(net, tuned, loss.encoding)
         if tuned > 1:
             graphs[probe_file(tuned)] = probe_model(net, tuned, trainee.sgms, int8_sgms, loss)
-    for one in dict.fromkeys([*blocks, *map(one_block, range(1, most + 1))]):
+    for one in every_block(most, blocks):
         graphs |= build_steps(trainee, int8_sgms, one)
     return graphs
 

@@ -83,10 +83,17 @@ class Trace:
 def step_memory(
     bundle: Bundle, precision: Precision, blocks: Blocks, batch: int, threads: int = 1
 ) -> StepMemory:
-    """Of a step of SGD on so many crops.
+    """Of a step of SGD on so many crops, see :func:`graph_memory`."""
+    return graph_memory(bundle, step_file(precision, "sgd", blocks), blocks, batch, threads)
+
+
+def graph_memory(
+    bundle: Bundle, name: str, blocks: Blocks, batch: int, threads: int = 1
+) -> StepMemory:
+    """Of one of the bundle's training steps, which is of these blocks, on so many crops.
 
     Raises:
-        QsgmError: the bundle's graph does not fit what it is given.
+        QsgmError: the graph is not there, or does not fit what it is given.
     """
 
     def two_steps(session: ort.InferenceSession) -> None:
@@ -96,7 +103,7 @@ def step_memory(
             step()
             step()
 
-    trace = traced(bundle.graph_path(step_file(precision, "sgd", blocks)), two_steps, threads)
+    trace = traced(bundle.graph_path(name), two_steps, threads)
     peak = live_peak(trace.nodes, trace.bound)
     before = trace.before
     asked = None if before is None else [most - before for most in trace.in_use]

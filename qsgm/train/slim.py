@@ -90,9 +90,7 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
     files |= {NETWORK: network, WEIGHTS: shared.data}
     manifest = kept_manifest(bundle, blocks) | {
         "sgms": sgms,
-        "files": {
-            name: {"sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()
-        },
+        "files": {name: kept_entry(bundle, name, data) for name, data in files.items()},
     }
     files[MANIFEST] = json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()
     with new_folder(output, WEIGHTS) as new:
@@ -126,6 +124,13 @@ def kept_sgms(bundle: Bundle, blocks: Blocks, shared: SharedConstants) -> dict[s
         }
         for layer in single_layers(len(blocks.layers)).sgm_layers
     }
+
+
+def kept_entry(bundle: Bundle, name: str, data: bytes) -> dict[str, Any]:
+    """What the manifest says of a file: what it holds, and of a step the memory it takes."""
+    peak = bundle.peak_activation_bytes(name)
+    memory = {} if peak is None else {"peak_activation_bytes": peak}
+    return {"sha256": hashlib.sha256(data).hexdigest(), **memory}
 
 
 def kept_recipe(recipe: Mapping[str, Any], text: str) -> dict[str, Any]:
