@@ -378,10 +378,15 @@ def _are_recipes(manifest: Mapping[str, Any]) -> bool:
         for text, rates in (one for some in recipe["rates"].values() for one in some.items()):
             if len(rates) != len(parse_blocks(text).layers):
                 return False
-            if not all(0 < float(rate) < math.inf for rate in rates):
+            if not all(_is_number(rate) and rate > 0 for rate in rates):
                 return False
     gains = manifest["recipes"]["sgm"]["short_gains"]
-    return all(1 <= float(gains[text]) < math.inf for text in can_tune["sgm"])
+    return all(_is_number(gains[text]) and gains[text] >= 1 for text in can_tune["sgm"])
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is one that a float can hold; raises OverflowError for a whole one too large."""
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 # key: (what is expected, whether the manifest has it); in this order

@@ -17,7 +17,7 @@ from qsgm.weights import to_step_layout
 def step_seconds(bundle: Bundle, tuned: int, repeats: int, threads: int) -> dict[str, float]:
     """Median of a step's seconds by variant, which take turns."""
     jobs = {
-        "forward": forward_pass(bundle, tuned, threads),
+        "forward": forward_job(bundle.session(head_file(tuned), threads), start_of(bundle, tuned)),
         "backprop": step_job(bundle, "float", one_block(tuned), threads),
         "sgm_float": step_job(bundle, "float", single_layers(tuned), threads),
         "sgm_int8": step_job(bundle, "int8", single_layers(tuned), threads),
@@ -46,10 +46,9 @@ def check_steps(bundle: Bundle, tuned: int) -> None:
         bundle.graph_path(name)
 
 
-def forward_pass(bundle: Bundle, tuned: int, threads: int) -> Callable[[], object]:
-    """The tuned layers on one batch, without training."""
-    session = bundle.session(head_file(tuned), threads)
-    feeds = {"features": random_features(session), **start_of(bundle, tuned)}
+def forward_job(session: Any, start: Mapping[str, Any], batch: int = BATCH) -> Callable[[], object]:
+    """The tuned layers, by a session of their head, on so many crops, without training."""
+    feeds = {"features": random_features(session, batch), **start}
     return lambda: session.run(["outputs"], feeds)
 
 

@@ -304,7 +304,7 @@ def bundle_files(
     }
     shared.take_from(model for name, model in graphs.items() if name != NETWORK)
     files = {name: model.SerializeToString() for name, model in graphs.items()}
-    return files | {WEIGHTS: shared.data}, sgms
+    return files | {NETWORK: network, WEIGHTS: shared.data}, sgms
 
 
 def describe(

@@ -24,7 +24,7 @@ from qsgm.bench.growth import (
     U8_8,
     U8_16,
 )
-from qsgm.bench.step_jobs import random_features, start_of, still_loop
+from qsgm.bench.step_jobs import forward_job, start_of, still_loop
 from qsgm.blocks import LAYERS, Blocks, one_block, single_layers, tuned_layers
 from qsgm.bundle import Bundle, Precision, head_file, step_file
 from qsgm.preparing import SLICE
@@ -68,18 +68,12 @@ def bundle_jobs(bundle: Bundle, tuned: int, batch: int, threads: int) -> Jobs:
     return jobs
 
 
-def forward_job(session: ort.InferenceSession, start: Mapping[str, Any], batch: int) -> Job:
-    """The tuned layers on one batch, without training."""
-    feeds = {"features": random_features(session, batch), **start}
-    return lambda: session.run(["outputs"], feeds)
-
-
 def wide_jobs(bundle: Bundle, width: int, threads: int) -> Jobs:
     """The same with wider layers, and with SGMs that are as much wider."""
     wide, layers = wide_net(width), tuned_layers(TUNED)
     start = wide.start(layers)
     head = opened(head_model(wide.net, TUNED, bundle.encoding), threads)
-    jobs = {FORWARD: forward_job(head, start, BATCH)}
+    jobs = {FORWARD: forward_job(head, start)}
     for name, model in wide_steps(bundle, wide, width).items():
         blocks = one_block(TUNED) if name == BP else single_layers(TUNED)
         jobs[name] = still_loop(opened(model, threads), start, blocks, BATCH)
@@ -114,7 +108,7 @@ def trunk_jobs(width: int, threads: int) -> Jobs:
     sessions = {
         ALONE: opened(trunk_model(wide.net, frozen), threads),
         U8_8: opened(int8, threads),
-        S8_8: opened_with_s8(int8, threads),
+        S8_8: opened(with_s8_weights(int8), threads),
     }
     return {name: run_job(session, feeds) for name, session in sessions.items()}
 
@@ -127,7 +121,7 @@ def sgm_jobs(layer: int, hidden: Sequence[int], threads: int) -> Jobs:
     kinds: tuple[tuple[ActivationBits, str, str], ...] = ((16, U8_16, S8_16), (8, U8_8, S8_8))
     for bits, u8, s8 in kinds:
         int8 = sgm_model(quantized(sgm, bits), channels, side)
-        sessions |= {u8: opened(int8, threads), s8: opened_with_s8(int8, threads)}
+        sessions |= {u8: opened(int8, threads), s8: opened(with_s8_weights(int8), threads)}
     rng = np.random.default_rng(0)
     feeds = {
         "activation": rng.uniform(0, 1, (BATCH * side**2, channels)).astype(np.float32),
@@ -146,13 +140,11 @@ def opened(model: ModelProto, threads: int) -> ort.InferenceSession:
     return open_session(model.SerializeToString(), threads)
 
 
-def opened_with_s8(model: ModelProto, threads: int) -> ort.InferenceSession:
-    """A session that multiplies u8 by s8: exact where the CPU has VNNI, elsewhere it saturates."""
-    return opened(with_s8_weights(model), threads)
-
-
 def with_s8_weights(model: ModelProto) -> ModelProto:
-    """The same graph, its u8 weights and their zero point both lower by the zero point."""
+    """The same graph, its u8 weights and their zero point both lower by the zero point.
+
+    It multiplies u8 by s8: exactly where the CPU has VNNI, elsewhere sums saturate.
+    """
     signed = constants_folded(model)
     constants = {tensor.name: tensor for tensor in signed.graph.initializer}
     for node in signed.graph.node:

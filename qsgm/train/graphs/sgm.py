@@ -22,6 +22,9 @@ from qsgm.quantize import (
 from qsgm.train.graphs.build import Ops, Value
 from qsgm.train.graphs.layers import at_every_position, gather_windows
 
+# Places of the planes of a weight.
+FINE, COARSE = range(2)
+
 
 def sgm_gradient(
     op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, labels: Value
@@ -141,25 +144,24 @@ def int8_product(
     `name` is what the product's constants begin with. The bias has the scale of what it is added
     to, exactly: that input's scale is 1.
     """
-    fine, coarse = weight_planes(op, name, product, sgm.kernel**2)
     # What the runtime folds has to be where it finds constants: outside of any loop.
-    outside = op.outside()
-    coarse_scale = outside.Mul(f"{name}/scale", op.constant(float(PLANE_STEPS)))
-    bias = op.DequantizeLinear(f"{name}/bias", f"{name}/scale", axis=0)
+    outside, weight, scale = op.outside(), f"{name}/weight", f"{name}/scale"
+    coarse = weight_plane(outside, weight, product, sgm.kernel**2, COARSE)
+    coarse_scale = outside.Mul(scale, op.constant(float(PLANE_STEPS)))
     first = op.Gemm(high, s8_weight(op, coarse, coarse_scale, product), transB=1)
-    rest = f"{name}/weight" if sgm.bits == 16 else fine
-    second = op.Gemm(both, s8_weight(op, rest, f"{name}/scale", product), bias, transB=1)
-    return op.Add(first, second)
+    if sgm.bits == 8:
+        weight = weight_plane(outside, weight, product, sgm.kernel**2, FINE)
+    bias = op.DequantizeLinear(f"{name}/bias", scale, axis=0)
+    rest = op.Gemm(both, s8_weight(op, weight, scale, product), bias, transB=1)
+    return op.Add(first, rest)
 
 
-def weight_planes(op: Ops, name: str, product: QuantizedProduct, taps: int) -> tuple[Value, Value]:
-    """The fine and the coarse plane (O, I) of a product's weights: slices, folded on loading."""
-    outside, (rows, width) = op.outside(), product.fine.shape
-    channels = width // taps
-    weight = outside.Reshape(f"{name}/weight", op.shape(rows, taps, 2, channels))
-    halves = (outside.Slice(weight, op.shape(i), op.shape(i + 1), op.shape(2)) for i in range(2))
-    fine, coarse = (outside.Reshape(half, op.shape(rows, width)) for half in halves)
-    return fine, coarse
+def weight_plane(op: Ops, both: Value, product: QuantizedProduct, taps: int, plane: int) -> Value:
+    """One plane (O, I) of a product's weights, of which both lie side by side, (O, 2 * I)."""
+    rows, width = product.fine.shape
+    planes = op.Reshape(both, op.shape(rows, taps, 2, width // taps))
+    one = op.Slice(planes, op.shape(plane), op.shape(plane + 1), op.shape(2))
+    return op.Reshape(one, op.shape(rows, width))
 
 
 def s8_weight(op: Ops, weight: Value, scale: Value, product: QuantizedProduct) -> Value:
