@@ -25,7 +25,7 @@ from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128
 # Windows of one crop, above which a block with an SGM goes crop by crop. Layers 1 and 2 are quicker
-# so; layer 3, with 169, adds a tenth to a step of four layers, which then takes a quarter of the
+# so; layer 3, with 169, adds a fifth to a step of four layers, which then takes a quarter of the
 # memory. Layer 4 has 25, and a crop's product reads all weights anew: a step of three layers would
 # take twice as long.
 MANY_WINDOWS = 100
