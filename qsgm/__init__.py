@@ -9,9 +9,17 @@ detection, heatmap = load_object(Path("mug")).locate(read_frame(Path("scene.png"
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 from qsgm.errors import QsgmError
+
+# From 1.29 on ONNX Runtime, by itself and from the moment it is imported, writes a device id and an
+# event database under the user's cache and looks up a collector for them; a forked child that ends
+# normally then never ends. disable_telemetry_events() comes too late. This comes in time, because
+# Python imports a package before any of its modules; whoever imports ONNX Runtime before qsgm has
+# to set it. A setting of the user's own stays.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from qsgm.bundle import load_bundle
