@@ -1,4 +1,8 @@
-"""The differentiable training steps against autograd through plain torch convolutions."""
+"""The differentiable training steps against autograd through plain torch convolutions.
+
+Both in float64: in float32 two right ways to add up thousands of positions differ by more than
+some wrong ways do, and by how much is up to the CPU.
+"""
 
 import pytest
 import torch
@@ -21,7 +25,23 @@ SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees
 RATES = {1: 0.01, 2: 0.02, 3: 0.03, 4: 0.1, 5: 0.2, 6: 0.3}
 LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=2.0)]
 
+DTYPE = torch.float64
+ROUNDING = 1e-12  # of the largest entry
+
 Weights = dict[int, tuple[Tensor, Tensor]]  # per layer: (Co, Ci, kh, kw) and (Co,)
+
+
+def normal(*shape: int) -> Tensor:
+    return torch.randn(shape, dtype=DTYPE)
+
+
+def assert_equal(got: Tensor, expected: Tensor) -> None:
+    """But for float64's rounding; sums cancel, so it counts against the largest entry."""
+    assert got.dtype == expected.dtype == DTYPE  # float32 somewhere inside shows in the numbers
+    assert got.shape == expected.shape
+    largest = float(expected.abs().max())
+    assert largest > 0
+    assert float((got - expected).abs().max()) <= ROUNDING * largest
 
 
 def random_weights(tuned: int) -> list[Weights]:
@@ -29,7 +49,7 @@ def random_weights(tuned: int) -> list[Weights]:
     torch.manual_seed(tuned)
     return [
         {
-            number: (torch.randn(shape) / 5, torch.randn(shape[0]) / 5)
+            number: (normal(*shape) / 5, normal(shape[0]) / 5)
             for number, shape in SHAPES.items()
             if number > 6 - tuned
         }
@@ -39,9 +59,9 @@ def random_weights(tuned: int) -> list[Weights]:
 
 def random_data(tuned: int) -> tuple[Tensor, Tensor]:
     first = 7 - tuned
-    features = torch.randn(TASKS, BATCH, SIDE[first] ** 2, SHAPES[first][1]).relu()
-    angle = torch.randn(TASKS, BATCH)
-    quality = (angle > -0.5).float()
+    features = normal(TASKS, BATCH, SIDE[first] ** 2, SHAPES[first][1]).relu()
+    angle = normal(TASKS, BATCH)
+    quality = (angle > -0.5).to(DTYPE)
     return features, torch.stack([quality, angle.sin(), angle.cos()], dim=-1)
 
 
@@ -87,7 +107,7 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
             return loss_gradient(loss, activation, labels[:, :, None])
         return made_up_gradient(layer, activation, labels)
 
-    rates = [torch.tensor(RATES[number]) for number in tasks[0]]
+    rates = [torch.tensor(RATES[number], dtype=DTYPE) for number in tasks[0]]
     updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
     twice = local_step(updated, features, labels, rates, gradient_of, momentum=0.9)
     for task, weights in enumerate(tasks):
@@ -104,14 +124,20 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
                 objective = (after * injected).sum() / BATCH
             weight, bias = flat_gradients(number, weights, objective)
             before, once = states[index], updated[index]
-            moved = before.weight[task] - RATES[number] * weight
-            torch.testing.assert_close(once.weight[task], moved, atol=1e-5, rtol=1e-5)
-            moved = before.bias[task] - RATES[number] * bias
-            torch.testing.assert_close(once.bias[task], moved, atol=1e-5, rtol=1e-5)
-            torch.testing.assert_close(once.weight_momentum[task], weight, atol=1e-5, rtol=1e-5)
-            # The second step moves by what its own momentum says, which remembers the first's.
-            moved = once.weight - RATES[number] * twice[index].weight_momentum
-            torch.testing.assert_close(twice[index].weight, moved)
+            assert_equal(once.weight_momentum[task], weight)
+            assert_equal(once.bias_momentum[task], bias)
+            assert_equal(once.weight[task], before.weight[task] - RATES[number] * weight)
+            assert_equal(once.bias[task], before.bias[task] - RATES[number] * bias)
+    # The second step is a first one from there, but for the momentum, which remembers.
+    forgetful = [LayerState.start(once.weight, once.bias) for once in updated]
+    fresh = local_step(forgetful, features, labels, rates, gradient_of, momentum=0.9)
+    for rate, once, anew, second in zip(rates, updated, fresh, twice, strict=True):
+        momentum = 0.9 * once.weight_momentum + anew.weight_momentum
+        assert_equal(second.weight_momentum, momentum)
+        assert_equal(second.weight, once.weight - rate * momentum)
+        momentum = 0.9 * once.bias_momentum + anew.bias_momentum
+        assert_equal(second.bias_momentum, momentum)
+        assert_equal(second.bias, once.bias - rate * momentum)
 
 
 @pytest.mark.parametrize("tuned", range(1, 7))
@@ -122,16 +148,16 @@ def test_outputs_equal_plain_convolutions(tuned: int) -> None:
         x = as_map(features[task])
         for number in weights:
             x = plain_layer(number, weights, x)
-        torch.testing.assert_close(got[task], x.flatten(1), atol=1e-5, rtol=1e-5)
+        assert_equal(got[task], x.flatten(1))
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
 def test_loss_gradient_equals_autograd(loss: Loss) -> None:
     torch.manual_seed(0)
-    raw = (3 * torch.randn(50, 3)).requires_grad_()
-    labels = torch.rand(50, 3).round()
+    raw = (3 * normal(50, 3)).requires_grad_()
+    labels = torch.rand(50, 3, dtype=DTYPE).round()
     (expected,) = torch.autograd.grad(loss.per_sample(raw, labels).sum(), raw)
-    torch.testing.assert_close(loss_gradient(loss, raw.detach(), labels), expected)
+    assert_equal(loss_gradient(loss, raw.detach(), labels), expected)
 
 
 @pytest.mark.parametrize("tuned", range(1, 7))
@@ -148,20 +174,20 @@ def test_true_gradients_equal_autograd(tuned: int, loss: Loss) -> None:
         expected = torch.autograd.grad(total, list(activations.values()))
         for number, gradient in zip(activations, expected, strict=True):
             rows = gradient.flatten(2).transpose(1, 2)
-            torch.testing.assert_close(got[number][task], rows, atol=1e-5, rtol=1e-5)
+            assert_equal(got[number][task], rows)
 
 
 def test_meta_gradients_flow_through_a_step() -> None:
     features, labels = random_data(2)
     states = as_states(random_weights(2))
-    scale = torch.ones(2, requires_grad=True)
+    scale = torch.ones(2, dtype=DTYPE, requires_grad=True)
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
             return loss_gradient(Loss(), activation, labels[:, :, None])
         return scale[0] * made_up_gradient(layer, activation, labels)
 
-    rates = [scale[1] * 0.1, torch.tensor(0.1)]
+    rates = [scale[1] * 0.1, torch.tensor(0.1, dtype=DTYPE)]
     updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
     raw = outputs(updated, features)
     Loss()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
