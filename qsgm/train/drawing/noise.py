@@ -5,7 +5,7 @@ about 1 unless said otherwise; lengths are pixels; colours are BGR, 0 to 255.
 """
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -113,3 +113,15 @@ def mixed(first: Colour, second: Colour, share: float) -> Colour:
 def chance(rng: np.random.Generator, probability: float) -> bool:
     """True with the given probability."""
     return bool(rng.random() < probability)
+
+
+def drawn_from(rng: np.random.Generator, kinds: Sequence[str], weights: Mapping[str, float]) -> str:
+    """One of the kinds; one without a weight counts 1."""
+    share = np.array([weights.get(kind, 1.0) for kind in kinds])
+    return kinds[rng.choice(len(kinds), p=share / share.sum())]
+
+
+def mean_colour(image: NDArray[np.uint8]) -> Colour:
+    """Mean colour of a BGR image, of every 16th pixel each way."""
+    blue, green, red = image[::16, ::16].reshape(-1, 3).mean(axis=0).tolist()
+    return blue, green, red

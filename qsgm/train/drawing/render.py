@@ -16,6 +16,7 @@ from qsgm.train.drawing.noise import Colour, Field, blur, chance, hsv, smooth_no
 from qsgm.train.drawing.parts import Outline, Part, Shape
 
 SUPERSAMPLING = 3
+LEAST_CONTRAST = 14.0  # levels of 255, before the exposure; below it nobody could tell
 _MARGIN_PX = 3
 _WORDS = ("COLA", "Fresh", "NUTRI", "soap", "MAX", "Juice 40", "Best", "OIL", "tea", "POWER", "ml")
 
@@ -27,6 +28,11 @@ class Light:
     x: float
     y: float
     z: float
+
+    def turned(self, angle: float) -> "Light":
+        """The light seen after a turn by ``angle`` [rad] clockwise as seen in the image."""
+        cos, sin = np.cos(angle), np.sin(angle)
+        return Light(self.x * cos - self.y * sin, self.y * cos + self.x * sin, self.z)
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,33 @@ class Sprite:
     colour: NDArray[np.float32]
     opacity: Field
     coverage: Field
+
+
+@dataclass(frozen=True)
+class Painted:
+    """An object lying along x, painted SUPERSAMPLING times as large, not yet lit.
+
+    Its centre is the middle of the arrays.
+    """
+
+    colour: NDArray[np.uint8]
+    """(h, w, 3) BGR, prints included."""
+    coverage: NDArray[np.uint8]
+    """(h, w), 255 inside the outline."""
+    opacity: NDArray[np.uint8]
+    """(h, w), below 255 where it is glass; 0 outside the outline."""
+    relief: Field
+    """(h, w) height above the table [pixels of this array]."""
+    gloss: Field
+    """(h, w) strength of the highlight, 0 to 1."""
+    tone: Field
+    """(h, w) brightness of the finish, about 1."""
+    ambient: np.float32
+    """Share of the light that comes from everywhere, 0 to 1."""
+    sharpness: np.float32
+    """Exponent of the highlight."""
+    brilliance: np.float32
+    """Brightness of the highlight [levels]."""
 
 
 def _each_outline(shape: Shape, change: Callable[[Outline], Outline]) -> Shape:
@@ -78,24 +111,53 @@ def fitted(shape: Shape, long_px: float, least_elongation: float, least_px: floa
 
 def render(shape: Shape, angle: float, light: Light, rng: np.random.Generator) -> Sprite:
     """Paints a fitted shape [px] turned by ``angle`` [rad] clockwise as seen in the image."""
+    painted = paint(shape, rng)
     points = _extent(shape)
-    half = np.ceil(np.abs(points).max(axis=0)).astype(int) + _MARGIN_PX
-    canvas = _Canvas(2 * half[0] * SUPERSAMPLING, 2 * half[1] * SUPERSAMPLING)
-    for part in shape:
-        canvas.add(part, rng)
-    cos, sin = np.cos(angle), np.sin(angle)
-    local = Light(light.x * cos + light.y * sin, light.y * cos - light.x * sin, light.z)
-    colour = canvas.shaded(local, rng)
     side = 2 * (int(np.ceil(np.hypot(*np.abs(points).max(axis=0)))) + _MARGIN_PX)
     layers = [
         _turned(layer, angle, side)
-        for layer in (colour, canvas.opacity * (canvas.coverage > 0), canvas.coverage)
+        for layer in (lit(painted, light.turned(-angle)), painted.opacity, painted.coverage)
     ]
     return Sprite(
         layers[0].astype(np.float32),
         layers[1].astype(np.float32) * np.float32(1 / 255),
         layers[2].astype(np.float32) * np.float32(1 / 255),
     )
+
+
+def paint(shape: Shape, rng: np.random.Generator) -> Painted:
+    """Paints a fitted shape [px] lying along x, with everything random about it but the light."""
+    half = np.ceil(np.abs(_extent(shape)).max(axis=0)).astype(int) + _MARGIN_PX
+    canvas = _Canvas(2 * half[0] * SUPERSAMPLING, 2 * half[1] * SUPERSAMPLING)
+    for part in shape:
+        canvas.add(part, rng)
+    return canvas.finished(rng)
+
+
+def lit(painted: Painted, light: Light) -> NDArray[np.uint8]:
+    """A painted object's colours (h, w, 3) lit from ``light``, times its opacity."""
+    slope_x = np.asarray(cv2.Sobel(painted.relief, cv2.CV_32F, 1, 0, scale=1 / 8))
+    slope_y = np.asarray(cv2.Sobel(painted.relief, cv2.CV_32F, 0, 1, scale=1 / 8))
+    length = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    facing = (light.z - light.x * slope_x - light.y * slope_y) / length
+    ambient = painted.ambient
+    shade = ambient + (1 - ambient) * np.clip(facing / np.float32(light.z), 0, 1.5)
+    shade *= painted.tone
+    norm = np.sqrt(2 + 2 * light.z)
+    half = (light.z + 1 - light.x * slope_x - light.y * slope_y) / (length * np.float32(norm))
+    spark = np.clip(half, 0, 1) ** painted.sharpness * painted.gloss
+    spark *= painted.brilliance
+    opaque = painted.opacity.astype(np.float32) * np.float32(1 / 255)
+    matt = painted.colour * (shade * opaque)[..., None]
+    glossy = matt + (spark * (painted.coverage > 0))[..., None]
+    return np.clip(glossy, 0, 255).astype(np.uint8)
+
+
+def contrast(sprite: Sprite, table: Colour) -> float:
+    """Mean difference [levels] between the object and the table it hides."""
+    hidden = sprite.opacity[..., None] * np.array(table, np.float32)
+    area = np.maximum(sprite.coverage.sum(), 1.0)
+    return float(np.abs(sprite.colour - hidden).max(axis=-1).sum() / area)
 
 
 def _turned(layer: NDArray[np.uint8], angle: float, side: int) -> NDArray[np.uint8]:
@@ -152,23 +214,22 @@ class _Canvas:
         self.gloss[area][on] = part.gloss
         self.relief[area][on] = _relief(mask, part)[1:-1, 1:-1][on]
 
-    def shaded(self, light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The painted colours lit from ``light``, times the opacity."""
-        height = blur(self.relief, rng.uniform(1.0, 2.5))
-        slope_x = np.asarray(cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=1 / 8))
-        slope_y = np.asarray(cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=1 / 8))
-        length = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
-        facing = (light.z - light.x * slope_x - light.y * slope_y) / length
+    def finished(self, rng: np.random.Generator) -> Painted:
+        """What was painted, with a finish drawn at random."""
+        relief = blur(self.relief, rng.uniform(1.0, 2.5))
         ambient = np.float32(rng.uniform(0.3, 0.8))
-        shade = ambient + (1 - ambient) * np.clip(facing / np.float32(light.z), 0, 1.5)
-        shade *= 1 + np.float32(rng.uniform(0, 0.10)) * smooth_noise(rng, shade.shape[:2], 30)
-        norm = np.sqrt(2 + 2 * light.z)
-        half = (light.z + 1 - light.x * slope_x - light.y * slope_y) / (length * np.float32(norm))
-        spark = np.clip(half, 0, 1) ** np.float32(rng.uniform(12, 90)) * self.gloss
-        spark *= np.float32(rng.uniform(60, 230))
-        opaque = self.opacity.astype(np.float32) * np.float32(1 / 255)
-        lit = self.colour * (shade * opaque)[..., None] + (spark * (self.coverage > 0))[..., None]
-        return np.clip(lit, 0, 255).astype(np.uint8)
+        unevenness = np.float32(rng.uniform(0, 0.10))
+        return Painted(
+            colour=self.colour,
+            coverage=self.coverage,
+            opacity=self.opacity * (self.coverage > 0),
+            relief=relief,
+            gloss=self.gloss,
+            tone=1 + unevenness * smooth_noise(rng, self.coverage.shape, 30),
+            ambient=ambient,
+            sharpness=np.float32(rng.uniform(12, 90)),
+            brilliance=np.float32(rng.uniform(60, 230)),
+        )
 
 
 def _relief(mask: NDArray[np.uint8], part: Part) -> Field:

@@ -17,6 +17,7 @@ from qsgm.train.drawing.noise import (
     blur,
     chance,
     cloud_noise,
+    drawn_from,
     hsv,
     mixed,
     paint,
@@ -316,3 +317,11 @@ _PAINTERS: dict[str, Painter] = {
     "cloth": _cloth,
 }
 TABLE_KINDS: tuple[str, ...] = tuple(_PAINTERS)
+_TABLE_WEIGHTS = {"plain": 1.3, "gradient": 1.6, "planks": 2.2, "carpet": 1.2, "cloth": 0.4}
+
+
+def chosen_table(rng: np.random.Generator, kind: str | None) -> str:
+    """The kind asked for, or one at random."""
+    if kind is not None:
+        return kind
+    return drawn_from(rng, TABLE_KINDS, _TABLE_WEIGHTS)
