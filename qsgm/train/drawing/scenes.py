@@ -192,6 +192,25 @@ def draw_scene(
     )
 
 
+def draw_alone(drawn: DrawnObject, light: Light, side_px: int) -> Image:
+    """The object as it lies along x, without a table.
+
+    Returns (side, side, 4): BGR times opacity, and opacity; the centre of its rectangle is the
+    middle of the picture. Raises ValueError where it does not fit.
+    """
+    middle = (side_px - 1) / 2
+    lying = _cutout(drawn, View(), 0.0, (middle, middle), _single(light))
+    layer = lying.layer
+    rows, columns = (np.flatnonzero(layer[..., 3].any(axis=axis)) for axis in (1, 0))
+    x, y = lying.corner
+    left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+    if min(x + left, y + top) < 0 or max(x + right, y + bottom) > side_px:
+        raise ValueError(f"a {drawn.kind} of {drawn.size_px} px does not fit {side_px} px")
+    result = np.zeros((side_px, side_px, 4), np.uint8)
+    result[y + top : y + bottom, x + left : x + right] = layer[top:bottom, left:right]
+    return result
+
+
 def _put_all(
     rng: np.random.Generator,
     image: Image,
