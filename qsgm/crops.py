@@ -7,6 +7,7 @@ cutting is then deterministic and can go in slices, so that all crops never have
 together.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -111,15 +112,24 @@ def widened(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def cut_widened(wide: NDArray[np.uint8], plan: CropPlan) -> NDArray[np.uint8]:
     """:func:`cut_crops` of a frame (H, W, 4) that is :func:`widened` already."""
     crops = np.empty((len(plan), CROP_PX, CROP_PX, 3), dtype=np.uint8)
+    for crop, window, color in zip(crops, windows_of(wide, plan), plan.color, strict=True):
+        cv2.transform(window, color, crop)
+    return crops
+
+
+def windows_of(wide: NDArray[np.uint8], plan: CropPlan) -> Iterator[NDArray[np.uint8]]:
+    """Each planned crop (128, 128, 3) of a widened frame in the frame's own colours.
+
+    One array is used for all: what a caller does to it lasts until the next one is asked for.
+    """
     # Used for every crop: allocating them anew takes longer than converting.
     cut, narrow = (np.empty((CROP_PX, CROP_PX, channels), np.uint8) for channels in (4, 3))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     border = cv2.BORDER_REFLECT_101
-    for crop, window, color in zip(crops, _windows(plan), plan.color, strict=True):
+    for window in _windows(plan):
         cv2.warpAffine(wide, window, (CROP_PX, CROP_PX), cut, flags, border)
         cv2.cvtColor(cut, cv2.COLOR_BGRA2BGR, narrow)
-        cv2.transform(narrow, color, crop)
-    return crops
+        yield narrow
 
 
 def label_crops(

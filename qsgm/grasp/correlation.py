@@ -1,0 +1,307 @@
+"""Lay the demonstration's patch over a scene: where, how far turned and how large it fits best.
+
+Masked, normalised colour correlation: of the patch only the object's pixels count, each channel
+around its own mean, so that neither the table nor the light matters. Coarse to fine: at an eighth
+of the resolution every turn and a few scales are tried at every place within 24 px of a candidate;
+the best few go on to a quarter and to half of the resolution. All trials of one level are three
+matrix products.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import radians
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.grasp.patch import PATCH_PX, Patch
+
+Floats = NDArray[np.float32]
+
+WINDOW_PX = 128
+# Halvings of the resolution, coarse to fine.
+COARSE, MIDDLE, FINE = 3, 2, 1
+SCALES = (0.85, 1.0, 1.18)
+# Variance [levels²] that a flat surface's noise has anyway: without it noise correlates with noise.
+NOISE_VARIANCE = 30.0
+
+_COARSE_POSES = tuple(
+    (float(turn), scale) for scale in SCALES for turn in np.deg2rad(np.arange(0, 360, 10))
+)
+_COARSE_REACH = 3  # px of the level
+_MIDDLE_TURNS = (-radians(5), 0.0, radians(5))
+_MIDDLE_SCALES, _MIDDLE_REACH = (0.93, 1.0, 1.07), 2
+_FINE_TURNS = (-radians(2.5), 0.0, radians(2.5))
+_FINE_SCALES, _FINE_REACH = (0.97, 1.0, 1.03), 2
+# Turns that differ by less are the same hypothesis.
+_SAME_TURN = np.deg2rad(25)
+_STARTS = 3
+# What a turn and a scale are rounded to, so that a template is made once.
+_TURN_STEP, _SCALE_STEP = np.deg2rad(0.5), 0.005
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One way in which the patch lies over a scene."""
+
+    score: float  # correlation, at most 1
+    turn_rad: float  # since the demonstration, counter-clockwise
+    scale: float
+    center_px: tuple[float, float]  # (x, y)
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """A frame at falling resolution; entry k is halved k times."""
+
+    levels: tuple[Floats, ...]  # (h, w, 3)
+
+
+def pyramid_of(frame: NDArray[np.uint8]) -> Pyramid:
+    """Halve a frame (H, W, 3) again and again: each pixel is the mean of four."""
+    levels = [frame.astype(np.float32)]
+    for _ in range(COARSE):
+        height, width = (max(side // 2, 1) for side in levels[-1].shape[:2])
+        halved = cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(halved, dtype=np.float32))
+    return Pyramid(tuple(levels))
+
+
+@dataclass(frozen=True)
+class Trials:
+    """K turned and scaled patches at one level, as rows of matrices."""
+
+    centred: Floats  # (K, 3 D): pixel minus mean, times the mask
+    mask: Floats  # (K, D), sums to 1
+    variance: Floats  # (K,)
+    mean: Floats  # (K, 3)
+
+
+@dataclass(frozen=True)
+class Template:
+    """A patch, ready to be laid over scenes; what it has been turned to is kept."""
+
+    patch: Patch
+    _turned: dict[tuple[int, int, int], Trials] = field(default_factory=dict)
+    _coarse: list[Trials] = field(default_factory=list)
+    _layers: dict[int, Floats] = field(default_factory=dict)
+
+    def trials(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
+        """The patch in every pose (turn [rad], scale), side by side."""
+        if level == COARSE:  # always the same poses
+            if not self._coarse:
+                self._coarse.append(self._side_by_side(level, poses))
+            return self._coarse[0]
+        return self._side_by_side(level, poses)
+
+    def _side_by_side(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
+        parts = [self._trial(level, *pose) for pose in poses]
+        return Trials(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("centred", "mask", "variance", "mean")
+            )
+        )
+
+    def _trial(self, level: int, turn: float, scale: float) -> Trials:
+        key = level, round(turn / _TURN_STEP) % round(2 * np.pi / _TURN_STEP), _scale_key(scale)
+        if key not in self._turned:
+            self._turned[key] = _trials_of(self.layer(level), level, turn, scale)
+        return self._turned[key]
+
+    def layer(self, level: int) -> Floats:
+        """Image and mask, (side, side, 4), at a level."""
+        if level not in self._layers:
+            both = np.dstack([self.patch.image, self.patch.mask]).astype(np.float32)
+            side = PATCH_PX >> level
+            small = cv2.resize(both, (side, side), interpolation=cv2.INTER_AREA)
+            self._layers[level] = np.asarray(small, dtype=np.float32)
+        return self._layers[level]
+
+
+def coarse_fits(
+    template: Template, scene: Pyramid, centers_px: Sequence[tuple[float, float]]
+) -> list[list[Fit]]:
+    """The best ways to lay the patch near each of some points, at an eighth of the resolution.
+
+    Args:
+        template: the demonstration's.
+        scene: its frame.
+        centers_px: where to look, each within 24 px.
+
+    Returns:
+        Up to three for each point, best first, their turns at least 25 degrees apart.
+    """
+    trials = template.trials(COARSE, _COARSE_POSES)
+    around = [windows_around(scene, COARSE, center, _COARSE_REACH) for center in centers_px]
+    scores, _, _ = correlate(np.concatenate([windows for windows, _ in around]), trials)
+    of_each = scores.reshape(len(around), -1, len(_COARSE_POSES))
+    return [
+        _distinct(some, places, _COARSE_POSES)
+        for some, (_, places) in zip(of_each, around, strict=True)
+    ]
+
+
+def middle_fit(template: Template, scene: Pyramid, start: Fit) -> Fit:
+    """A coarse fit at a quarter of the resolution."""
+    return _refined(template, scene, MIDDLE, start, _MIDDLE_TURNS, _MIDDLE_SCALES, _MIDDLE_REACH)
+
+
+def refine_fit(template: Template, scene: Pyramid, fit: Fit) -> Fit:
+    """The same fit at half of the resolution, between pixels and between turns."""
+    fine = _refined(template, scene, FINE, fit, _FINE_TURNS, _FINE_SCALES, _FINE_REACH)
+    return _between(template, scene, fine)
+
+
+def _refined(
+    template: Template,
+    scene: Pyramid,
+    level: int,
+    start: Fit,
+    turns: Sequence[float],
+    scales: Sequence[float],
+    reach: int,
+) -> Fit:
+    poses = [(start.turn_rad + turn, start.scale * scale) for scale in scales for turn in turns]
+    scores, places = _scores(template, scene, level, poses, start.center_px, reach)
+    place, pose = np.unravel_index(int(scores.argmax()), scores.shape)
+    return Fit(float(scores[place, pose]), *poses[pose], tuple(places[place]))
+
+
+def _between(template: Template, scene: Pyramid, fit: Fit) -> Fit:
+    """Move to the top of the parabolas through the scores beside the best place and turn."""
+    step = 1 << FINE
+    poses = [(fit.turn_rad + turn, fit.scale) for turn in _FINE_TURNS]
+    scores, places = _scores(template, scene, FINE, poses, fit.center_px, 1)
+    around = scores.reshape(3, 3, 3)  # rows, columns, turns
+    x = places[4][0] + step * _peak_offset(around[1, :, 1])
+    y = places[4][1] + step * _peak_offset(around[:, 1, 1])
+    turn = fit.turn_rad + _FINE_TURNS[2] * _peak_offset(around[1, 1, :])
+    return Fit(max(fit.score, float(around[1, 1, 1])), turn, fit.scale, (float(x), float(y)))
+
+
+def _peak_offset(three: NDArray[np.floating]) -> float:
+    """Where between -1 and 1 the parabola through three values has its top."""
+    before, here, after = (float(value) for value in three)
+    bend = before - 2 * here + after
+    return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -1, 1))
+
+
+def _distinct(scores: Floats, places: Floats, poses: Sequence[tuple[float, float]]) -> list[Fit]:
+    """The best trials whose turns differ, as starts for the next level."""
+    best = scores.max(axis=0)
+    starts: list[Fit] = []
+    for pose in np.argsort(-best, kind="stable"):
+        turn, scale = poses[pose]
+        if all(abs(_wrapped(turn - start.turn_rad)) > _SAME_TURN for start in starts):
+            place = places[int(scores[:, pose].argmax())]
+            starts.append(Fit(float(best[pose]), turn, scale, (float(place[0]), float(place[1]))))
+        if len(starts) == _STARTS:
+            break
+    return starts
+
+
+def _scores(
+    template: Template,
+    scene: Pyramid,
+    level: int,
+    poses: Sequence[tuple[float, float]],
+    center_px: tuple[float, float],
+    reach: int,
+) -> tuple[Floats, Floats]:
+    """Correlation (A, K) of K poses at A places, and the places (A, 2) [px of the frame]."""
+    trials = template.trials(level, poses)
+    windows, places = windows_around(scene, level, center_px, reach)
+    score, _, _ = correlate(windows, trials)
+    return score, places
+
+
+def correlate(windows: Floats, trials: Trials) -> tuple[Floats, Floats, Floats]:
+    """Masked colour correlation of windows (A, 3, D) with K trials.
+
+    Returns:
+        Correlation (A, K); the windows' means under each mask (A, 3, K) and variances (A, K).
+    """
+    count, channels, pixels = windows.shape
+    mean = (windows.reshape(-1, pixels) @ trials.mask.T).reshape(count, channels, -1)
+    square = np.einsum("acd,acd->ad", windows, windows) @ trials.mask.T
+    variance = np.maximum(square - np.einsum("ack,ack->ak", mean, mean), 0.0)
+    product = windows.reshape(count, -1) @ trials.centred.T
+    size = (variance + NOISE_VARIANCE) * (trials.variance + NOISE_VARIANCE)
+    return product / np.sqrt(size), mean, variance
+
+
+def windows_around(
+    scene: Pyramid, level: int, center_px: tuple[float, float], reach: int
+) -> tuple[Floats, Floats]:
+    """All windows (A, 3, D) of a level within `reach` pixels of a point, and their centres (A, 2).
+
+    A centre is in pixels of the frame; beyond the border the frame is mirrored.
+    """
+    side, step = WINDOW_PX >> level, 1 << level
+    image = scene.levels[level]
+    left, top = (round((value + 0.5) / step - side / 2) - reach for value in center_px)
+    region = _mirrored(image, left, top, side + 2 * reach)
+    at = np.arange(2 * reach + 1)
+    windows = np.empty((len(at), len(at), 3, side, side), np.float32)
+    channels = region.transpose(2, 0, 1)
+    for down in at:
+        for right in at:
+            windows[down, right] = channels[:, down : down + side, right : right + side]
+    x, y = (step * (first + at + side / 2) - 0.5 for first in (left, top))
+    places = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
+    return windows.reshape(-1, 3, side * side), places.astype(np.float32)
+
+
+def _mirrored(image: Floats, left: int, top: int, side: int) -> Floats:
+    """A square of an image (h, w, 3), mirrored where it reaches over the border."""
+    height, width = image.shape[:2]
+    if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+        return image[top : top + side, left : left + side]
+    rows, cols = (
+        _reflected(first + np.arange(side), n) for first, n in ((top, height), (left, width))
+    )
+    return image[rows[:, None], cols]
+
+
+def _reflected(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Indices of a line mirrored at both ends, the end itself not repeated."""
+    period = max(2 * size - 2, 1)
+    folded = np.mod(index, period)
+    return np.asarray(np.minimum(folded, period - folded))
+
+
+def _trials_of(layer: Floats, level: int, turn: float, scale: float) -> Trials:
+    """One pose of a patch (side, side, 4), image and mask, as a single trial."""
+    side = WINDOW_PX >> level
+    cos, sin = np.cos(turn) / scale, np.sin(turn) / scale
+    inverse = np.array([[cos, -sin], [sin, cos]])  # from the turned window to the patch
+    middle = (len(layer) - 1) / 2
+    shift = middle - inverse @ np.full(2, (side - 1) / 2)
+    motion = np.concatenate([inverse, shift[:, None]], axis=1)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned = cv2.warpAffine(
+        layer, motion, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    pixels = turned.reshape(-1, 4)
+    mask = pixels[:, 3] / max(float(pixels[:, 3].sum()), 1e-6)
+    colour = pixels[:, :3].T  # (3, D)
+    mean = colour @ mask
+    centred = (colour - mean[:, None]) * mask
+    variance = float((centred * (colour - mean[:, None])).sum())
+    return Trials(
+        centred.reshape(1, -1).astype(np.float32),
+        mask[None].astype(np.float32),
+        np.array([variance], np.float32),
+        mean[None].astype(np.float32),
+    )
+
+
+def _scale_key(scale: float) -> int:
+    return round(scale / _SCALE_STEP)
+
+
+def _wrapped(angle: float) -> float:
+    """An angle [rad] in (-π, π]."""
+    return float(np.pi - (np.pi - angle) % (2 * np.pi))

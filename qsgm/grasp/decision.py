@@ -1,0 +1,90 @@
+"""Whether a candidate is the taught object: many pieces of evidence weighed into one quality.
+
+A small network of one hidden layer, trained on drawn scenes with the object and without it
+(:mod:`qsgm.train.decision`). Its threshold is set on whole scenes, for a stated rate of false
+alarms, and is part of the quality: from 0.5 on an object counts as found.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+from qsgm.grasp.evidence import NAMES
+
+Floats = NDArray[np.float32]
+FALSE_ALARM_RATE = 0.02  # of scenes without the object
+MOST_HIDDEN = 256
+
+
+@dataclass(frozen=True)
+class Decision:
+    """How evidence becomes a quality; F pieces, H hidden units."""
+
+    mean: Floats  # (F,) of the evidence
+    deviation: Floats  # (F,)
+    hidden: Floats  # (H, F)
+    hidden_bias: Floats  # (H,)
+    output: Floats  # (H,)
+    bias: float
+    threshold: float
+
+    def score(self, evidence: Floats) -> NDArray[np.float64]:
+        """Log odds of evidence (..., F) coming from the object, before the threshold: (...)."""
+        x = (np.asarray(evidence, np.float64) - self.mean) / self.deviation
+        units = np.maximum(x @ self.hidden.T.astype(np.float64) + self.hidden_bias, 0.0)
+        return np.asarray(units @ self.output.astype(np.float64) + self.bias)
+
+    def quality(self, evidence: Floats) -> NDArray[np.float64]:
+        """In (0, 1); from 0.5 on the object counts as found."""
+        odds = np.clip(self.score(evidence) - self.threshold, -60.0, 60.0)
+        return np.asarray(1 / (1 + np.exp(-odds)))
+
+    def to_json(self) -> dict[str, Any]:
+        """What :meth:`from_json` reads; seven digits keep a float32."""
+        arrays = {
+            name: [float(f"{value:.7g}") for value in np.ravel(getattr(self, name))]
+            for name in ("mean", "deviation", "hidden", "hidden_bias", "output")
+        }
+        return {"evidence": list(NAMES), **arrays, "bias": self.bias, "threshold": self.threshold}
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any], where: str) -> "Decision":
+        """Read a decision back.
+
+        Raises:
+            QsgmError: it weighs other evidence, or its numbers are not what they should be.
+        """
+        if not isinstance(values, Mapping) or values.get("evidence") != list(NAMES):
+            raise QsgmError(f"{where}: the decision weighs other evidence; {_ADVICE}")
+        try:
+            hidden_bias = np.array(values["hidden_bias"], np.float32)
+            hidden = np.array(values["hidden"], np.float32).reshape(len(hidden_bias), len(NAMES))
+            decision = Decision(
+                np.array(values["mean"], np.float32).reshape(len(NAMES)),
+                np.array(values["deviation"], np.float32).reshape(len(NAMES)),
+                hidden,
+                hidden_bias,
+                np.array(values["output"], np.float32).reshape(len(hidden_bias)),
+                float(values["bias"]),
+                float(values["threshold"]),
+            )
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise QsgmError(f"{where}: the decision's numbers do not fit; {_ADVICE}") from error
+        _check(decision, where)
+        return decision
+
+
+_ADVICE = "make it again with this version of qsgm"
+
+
+def _check(decision: Decision, where: str) -> None:
+    numbers = [np.ravel(value) for value in vars(decision).values()]
+    sound = all(np.isfinite(value).all() for value in numbers) and (decision.deviation > 0).all()
+    if not sound or not 1 <= len(decision.output) <= MOST_HIDDEN:
+        raise QsgmError(
+            f"{where}: the decision's numbers are not finite or out of range; {_ADVICE}"
+        )

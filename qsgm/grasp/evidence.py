@@ -1,0 +1,223 @@
+"""What speaks for and against a candidate being the taught object.
+
+The scene is turned, scaled and moved so that the candidate lies as the demonstration does; then the
+two are compared pixel by pixel, at half of the resolution. No single number tells an object from
+its like on another table, in other light, partly hidden: :data:`NAMES` lists those that together
+do, and a :class:`qsgm.grasp.decision.Decision` weighs them.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, WINDOW_PX, Fit, Pyramid, Template
+
+Floats = NDArray[np.float32]
+
+SIDE = WINDOW_PX >> FINE
+NAMES = (
+    "correlation",  # colours, each channel around its own mean
+    "joint_correlation",  # the same around the mean of all channels: hue counts
+    "edge_agreement",  # directions of the brightness gradient, sign ignored
+    "outline",  # share of the gradient at the outline that stands across it
+    "gain",  # |log| of how much brighter the object is
+    "tint",  # how far apart the three channels' gains are
+    "spread",  # log of the variance, seen over taught
+    "scale",  # |log|
+    "agreement_low",  # of six parts of the object: the two worst correlations' mean
+    "agreement_middle",  # and the median
+    "residual",  # median colour difference once brightness and contrast are fitted
+    "contrast",  # of the object to what lies around it
+    "detail",  # log of the taught object's own variance
+    "quality_logit",  # what the tuned network says
+    "turn_difference",  # |sine| of the angle between the network's turn and the patch's
+    "lead",  # over the best fit at another turn
+)
+_PARTS = 6
+_GRADIENT_NOISE = 4.0  # levels
+_RING_PX = 5  # of the level
+_LARGEST_LOGIT = 8.0
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The demonstration's side of every comparison, at half of the resolution."""
+
+    image: Floats  # (64, 64, 3)
+    mask: Floats  # (64, 64), sums to 1
+    rim: Floats  # (64, 64), the mask with its surroundings, sums to 1
+    ring: Floats  # (64, 64), around the object, sums to 1
+    outline: Floats  # (64, 64, 2), the outline's normal times its strength
+    parts: Floats  # (6, 64, 64), each sums to 1 or is empty
+    gradient: Floats  # (64, 64, 2)
+
+
+def reference_of(template: Template) -> Reference:
+    """Everything about a demonstration's patch that does not depend on the scene."""
+    image, solid = _upright(template)
+    mask = solid / max(float(solid.sum()), 1e-6)
+    wide = np.asarray(cv2.dilate(solid, np.ones((5, 5))), np.float32)
+    far = np.asarray(cv2.dilate(solid, np.ones((2 * _RING_PX + 3, 2 * _RING_PX + 3))), np.float32)
+    ring = np.clip(far - np.asarray(cv2.dilate(solid, np.ones((3, 3)))), 0, 1)
+    slope = np.dstack(_slopes(solid))
+    return Reference(
+        image,
+        mask,
+        wide / max(float(wide.sum()), 1e-6),
+        ring / max(float(ring.sum()), 1e-6),
+        slope / max(float(np.hypot(slope[..., 0], slope[..., 1]).sum()), 1e-6),
+        _parts(solid),
+        _directions(image),
+    )
+
+
+def evidence(
+    reference: Reference, scene: Pyramid, fit: Fit, quality: float, angle_rad: float, lead: float
+) -> Floats:
+    """One number for each of :data:`NAMES`.
+
+    Args:
+        reference: the demonstration.
+        scene: the frame.
+        fit: how the patch lies over it.
+        quality: of the network, in [0, 1].
+        angle_rad: the turn that the network sees there, modulo a half turn.
+        lead: the fit's correlation over that of the best one at another turn.
+    """
+    seen = as_taught(scene, fit)
+    image, mask = reference.image, reference.mask
+    mean, taught_mean = _means(seen, mask), _means(image, mask)
+    flat, taught_flat = seen - mean, image - taught_mean
+    weights = np.concatenate([mask[None], reference.parts]).reshape(1 + _PARTS, -1)
+    variances, taught_variances, products = _moments(flat, taught_flat) @ weights.T
+    correlations = products / np.sqrt(
+        (variances + NOISE_VARIANCE) * (taught_variances + NOISE_VARIANCE)
+    )
+    variance, taught_variance = float(variances[0]), float(taught_variances[0])
+    parts = np.sort(correlations[1:])
+    gains = np.log((mean + 8) / (taught_mean + 8))
+    ring = _means(seen, reference.ring)
+    odds = np.log(max(quality, 1e-6) / max(1 - quality, 1e-6))
+    values = (
+        correlations[0],
+        _correlation(seen - mean.mean(), image - taught_mean.mean(), mask),
+        _edge_agreement(seen, reference),
+        _outline_share(seen, reference),
+        abs(gains.mean()),
+        np.linalg.norm(gains - gains.mean()),
+        np.log((variance + NOISE_VARIANCE) / (taught_variance + NOISE_VARIANCE)),
+        abs(np.log(fit.scale)),
+        parts[:2].mean(),
+        np.median(parts),
+        _residual(flat, taught_flat, mask, variance, taught_variance),
+        np.abs(ring - mean).max() / 50,
+        np.log(taught_variance + NOISE_VARIANCE),
+        np.clip(odds, -_LARGEST_LOGIT, _LARGEST_LOGIT),
+        abs(np.sin(angle_rad - fit.turn_rad)),
+        lead,
+    )
+    return np.array(values, np.float32)
+
+
+def as_taught(scene: Pyramid, fit: Fit) -> Floats:
+    """The scene (64, 64, 3) moved so that the fitted object lies as in the demonstration."""
+    level = scene.levels[FINE]
+    step = 1 << FINE
+    cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
+    turn = np.array([[cos, sin], [-sin, cos]])  # from the upright window to the scene
+    center = (np.array(fit.center_px) + 0.5) / step - 0.5
+    motion = np.concatenate([turn, (center - turn @ np.full(2, (SIDE - 1) / 2))[:, None]], axis=1)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpAffine(level, motion, (SIDE, SIDE), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.float32)
+
+
+def _upright(template: Template) -> tuple[Floats, Floats]:
+    """Image (64, 64, 3) and mask (64, 64) in 0 to 1 of the patch's middle."""
+    layer = template.layer(FINE)
+    margin = (len(layer) - SIDE) // 2
+    middle = layer[margin : margin + SIDE, margin : margin + SIDE]
+    mask = middle[..., 3] / np.float32(255)
+    return np.ascontiguousarray(middle[..., :3]), np.ascontiguousarray(mask, dtype=np.float32)
+
+
+def _means(image: Floats, weight: Floats) -> Floats:
+    return np.asarray(np.tensordot(weight, image, ((0, 1), (0, 1))), dtype=np.float32)
+
+
+def _moments(seen: Floats, taught: Floats) -> Floats:
+    """Squares and product of two images (h, w, 3), summed over the channels: (3, h w)."""
+    pairs = ((seen, seen), (taught, taught), (seen, taught))
+    return np.stack([np.einsum("hwc,hwc->hw", *pair).ravel() for pair in pairs])
+
+
+def _correlation(seen: Floats, taught: Floats, weight: Floats) -> float:
+    variance, taught_variance, product = _moments(seen, taught) @ weight.ravel()
+    size = (variance + NOISE_VARIANCE) * (taught_variance + NOISE_VARIANCE)
+    return float(product / np.sqrt(size))
+
+
+def _residual(
+    seen: Floats, taught: Floats, mask: Floats, variance: float, taught_variance: float
+) -> float:
+    """Median of the largest channel's difference, in the taught object's standard deviations."""
+    inside = mask > 0.5 * mask.max()
+    if not inside.any():
+        return 0.0
+    spread = np.sqrt(taught_variance + NOISE_VARIANCE)
+    contrast = np.sqrt(variance + NOISE_VARIANCE) / spread
+    difference = np.abs(seen[inside] / contrast - taught[inside]).max(axis=1)
+    return float(np.median(difference) / spread)
+
+
+def _slopes(image: Floats) -> tuple[Floats, Floats]:
+    """Derivatives to the right and down (h, w), central differences, 0 at the border."""
+    right, down = np.zeros_like(image), np.zeros_like(image)
+    right[:, 1:-1] = image[:, 2:] - image[:, :-2]
+    down[1:-1] = image[2:] - image[:-2]
+    return right, down
+
+
+def _grey(image: Floats) -> Floats:
+    return np.asarray(image @ np.full(3, 1 / 3, np.float32))
+
+
+def _directions(image: Floats) -> Floats:
+    """Twice the gradient's angle as (cosine, sine), shorter where the gradient is weak."""
+    right, down = _slopes(_grey(image))
+    size = np.hypot(right, down) + _GRADIENT_NOISE
+    double = np.dstack([right * right - down * down, 2 * right * down])
+    return np.asarray(double / (size * size)[..., None], dtype=np.float32)
+
+
+def _edge_agreement(seen: Floats, reference: Reference) -> float:
+    here, there, weight = _directions(seen), reference.gradient, reference.rim
+    size_here, size_there, both = _moments(here, there) @ weight.ravel()
+    return float(both / np.sqrt((size_here + 1e-4) * (size_there + 1e-4)))
+
+
+def _outline_share(seen: Floats, reference: Reference) -> float:
+    right, down = _slopes(_grey(seen))
+    normal = reference.outline
+    across = np.abs(right * normal[..., 0] + down * normal[..., 1])
+    strength = np.hypot(normal[..., 0], normal[..., 1])
+    return float(
+        (across / (np.hypot(right, down) + _GRADIENT_NOISE)).sum() / (strength.sum() + 1e-6)
+    )
+
+
+def _parts(solid: Floats) -> Floats:
+    """Six parts of the mask, three along its long axis times both sides of it."""
+    y, x = np.nonzero(solid > 0.5)
+    parts = np.zeros((_PARTS, *solid.shape), np.float32)
+    if len(x) < _PARTS:
+        return parts
+    points = np.stack([x - x.mean(), y - y.mean()])
+    _, axes = np.linalg.eigh(points @ points.T)
+    across, along = axes.T @ points  # eigenvalues ascend
+    thirds = np.searchsorted(np.quantile(along, (1 / 3, 2 / 3)), along)
+    number = 2 * thirds + (across > np.median(across))
+    parts[number, y, x] = 1
+    return np.asarray(parts / np.maximum(parts.sum(axis=(1, 2), keepdims=True), 1), np.float32)
