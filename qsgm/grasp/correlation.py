@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.patch import PATCH_PX, Patch
+from qsgm.grasp.patch import PATCH_PX, Patch, mirrored_square
 
 Floats = NDArray[np.float32]
 
@@ -37,8 +37,6 @@ _FINE_SCALES, _FINE_REACH = (0.97, 1.0, 1.03), 2
 # Turns that differ by less are the same hypothesis.
 _SAME_TURN = np.deg2rad(25)
 _STARTS = 3
-# What a turn and a scale are rounded to, so that a template is made once.
-_TURN_STEP, _SCALE_STEP = np.deg2rad(0.5), 0.005
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,8 @@ def pyramid_of(frame: NDArray[np.uint8]) -> Pyramid:
     levels = [frame.astype(np.float32)]
     for _ in range(COARSE):
         height, width = (max(side // 2, 1) for side in levels[-1].shape[:2])
-        halved = cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA)
+        even = levels[-1][: 2 * height, : 2 * width]  # else a pixel would be of a little more
+        halved = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(halved, dtype=np.float32))
     return Pyramid(tuple(levels))
 
@@ -80,35 +79,19 @@ class Trials:
 
 @dataclass(frozen=True)
 class Template:
-    """A patch, ready to be laid over scenes; what it has been turned to is kept."""
+    """A patch, ready to be laid over scenes; what all of them need of it is kept."""
 
     patch: Patch
-    _turned: dict[tuple[int, int, int], Trials] = field(default_factory=dict)
     _coarse: list[Trials] = field(default_factory=list)
     _layers: dict[int, Floats] = field(default_factory=dict)
 
     def trials(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
         """The patch in every pose (turn [rad], scale), side by side."""
-        if level == COARSE:  # always the same poses
-            if not self._coarse:
-                self._coarse.append(self._side_by_side(level, poses))
-            return self._coarse[0]
-        return self._side_by_side(level, poses)
-
-    def _side_by_side(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
-        parts = [self._trial(level, *pose) for pose in poses]
-        return Trials(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("centred", "mask", "variance", "mean")
-            )
-        )
-
-    def _trial(self, level: int, turn: float, scale: float) -> Trials:
-        key = level, round(turn / _TURN_STEP) % round(2 * np.pi / _TURN_STEP), _scale_key(scale)
-        if key not in self._turned:
-            self._turned[key] = _trials_of(self.layer(level), level, turn, scale)
-        return self._turned[key]
+        if level != COARSE:
+            return _trials_of(self.layer(level), level, poses)
+        if not self._coarse:  # always the same poses
+            self._coarse.append(_trials_of(self.layer(level), level, poses))
+        return self._coarse[0]
 
     def layer(self, level: int) -> Floats:
         """Image and mask, (side, side, 4), at a level."""
@@ -242,10 +225,10 @@ def windows_around(
     side, step = WINDOW_PX >> level, 1 << level
     image = scene.levels[level]
     left, top = (round((value + 0.5) / step - side / 2) - reach for value in center_px)
-    region = _mirrored(image, left, top, side + 2 * reach)
+    region = mirrored_square(image, left, top, side + 2 * reach)
     at = np.arange(2 * reach + 1)
+    channels = np.ascontiguousarray(region.transpose(2, 0, 1))
     windows = np.empty((len(at), len(at), 3, side, side), np.float32)
-    channels = region.transpose(2, 0, 1)
     for down in at:
         for right in at:
             windows[down, right] = channels[:, down : down + side, right : right + side]
@@ -254,52 +237,32 @@ def windows_around(
     return windows.reshape(-1, 3, side * side), places.astype(np.float32)
 
 
-def _mirrored(image: Floats, left: int, top: int, side: int) -> Floats:
-    """A square of an image (h, w, 3), mirrored where it reaches over the border."""
-    height, width = image.shape[:2]
-    if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
-        return image[top : top + side, left : left + side]
-    rows, cols = (
-        _reflected(first + np.arange(side), n) for first, n in ((top, height), (left, width))
-    )
-    return image[rows[:, None], cols]
-
-
-def _reflected(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Indices of a line mirrored at both ends, the end itself not repeated."""
-    period = max(2 * size - 2, 1)
-    folded = np.mod(index, period)
-    return np.asarray(np.minimum(folded, period - folded))
-
-
-def _trials_of(layer: Floats, level: int, turn: float, scale: float) -> Trials:
-    """One pose of a patch (side, side, 4), image and mask, as a single trial."""
+def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
+    """A patch (side, side, 4), image and mask, in K poses."""
     side = WINDOW_PX >> level
-    cos, sin = np.cos(turn) / scale, np.sin(turn) / scale
-    inverse = np.array([[cos, -sin], [sin, cos]])  # from the turned window to the patch
-    middle = (len(layer) - 1) / 2
-    shift = middle - inverse @ np.full(2, (side - 1) / 2)
-    motion = np.concatenate([inverse, shift[:, None]], axis=1)
+    turned = np.empty((len(poses), side, side, 4), np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    turned = cv2.warpAffine(
-        layer, motion, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
-    pixels = turned.reshape(-1, 4)
-    mask = pixels[:, 3] / max(float(pixels[:, 3].sum()), 1e-6)
-    colour = pixels[:, :3].T  # (3, D)
-    mean = colour @ mask
-    centred = (colour - mean[:, None]) * mask
-    variance = float((centred * (colour - mean[:, None])).sum())
-    return Trials(
-        centred.reshape(1, -1).astype(np.float32),
-        mask[None].astype(np.float32),
-        np.array([variance], np.float32),
-        mean[None].astype(np.float32),
-    )
+    for window, pose in zip(turned, poses, strict=True):
+        motion = _motion(len(layer), side, *pose)
+        cv2.warpAffine(
+            layer, motion, (side, side), window, flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+    planes = np.ascontiguousarray(turned.reshape(len(poses), -1, 4).transpose(0, 2, 1))
+    colour, mask = planes[:, :3], planes[:, 3]
+    mask /= np.maximum(mask.sum(axis=1, keepdims=True), 1e-6)
+    mean = np.einsum("kcd,kd->kc", colour, mask)
+    colour -= mean[..., None]
+    centred = colour * mask[:, None]
+    variance = np.einsum("kcd,kcd->k", centred, colour)
+    return Trials(centred.reshape(len(poses), -1), mask, variance, mean)
 
 
-def _scale_key(scale: float) -> int:
-    return round(scale / _SCALE_STEP)
+def _motion(patch_px: int, side: int, turn: float, scale: float) -> NDArray[np.float64]:
+    """Map (2, 3) from a window's pixels to those of a patch that is turned and scaled in it."""
+    cos, sin = np.cos(turn) / scale, np.sin(turn) / scale
+    inverse = np.array([[cos, -sin], [sin, cos]])
+    shift = (patch_px - 1) / 2 - inverse @ np.full(2, (side - 1) / 2)
+    return np.concatenate([inverse, shift[:, None]], axis=1)
 
 
 def _wrapped(angle: float) -> float:

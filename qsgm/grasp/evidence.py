@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, WINDOW_PX, Fit, Pyramid, Template
+from qsgm.grasp.alignment import as_taught, slopes, upright
+from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, Pyramid, Template
 
 Floats = NDArray[np.float32]
 
-SIDE = WINDOW_PX >> FINE
 NAMES = (
     "correlation",  # colours, each channel around its own mean
     "joint_correlation",  # the same around the mean of all channels: hue counts
@@ -56,12 +56,12 @@ class Reference:
 
 def reference_of(template: Template) -> Reference:
     """Everything about a demonstration's patch that does not depend on the scene."""
-    image, solid = _upright(template)
+    image, solid = upright(template)
     mask = solid / max(float(solid.sum()), 1e-6)
     wide = np.asarray(cv2.dilate(solid, np.ones((5, 5))), np.float32)
     far = np.asarray(cv2.dilate(solid, np.ones((2 * _RING_PX + 3, 2 * _RING_PX + 3))), np.float32)
     ring = np.clip(far - np.asarray(cv2.dilate(solid, np.ones((3, 3)))), 0, 1)
-    slope = np.dstack(_slopes(solid))
+    slope = np.dstack(slopes(solid))
     return Reference(
         image,
         mask,
@@ -121,28 +121,6 @@ def evidence(
     return np.array(values, np.float32)
 
 
-def as_taught(scene: Pyramid, fit: Fit) -> Floats:
-    """The scene (64, 64, 3) moved so that the fitted object lies as in the demonstration."""
-    level = scene.levels[FINE]
-    step = 1 << FINE
-    cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
-    turn = np.array([[cos, sin], [-sin, cos]])  # from the upright window to the scene
-    center = (np.array(fit.center_px) + 0.5) / step - 0.5
-    motion = np.concatenate([turn, (center - turn @ np.full(2, (SIDE - 1) / 2))[:, None]], axis=1)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    seen = cv2.warpAffine(level, motion, (SIDE, SIDE), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(seen, dtype=np.float32)
-
-
-def _upright(template: Template) -> tuple[Floats, Floats]:
-    """Image (64, 64, 3) and mask (64, 64) in 0 to 1 of the patch's middle."""
-    layer = template.layer(FINE)
-    margin = (len(layer) - SIDE) // 2
-    middle = layer[margin : margin + SIDE, margin : margin + SIDE]
-    mask = middle[..., 3] / np.float32(255)
-    return np.ascontiguousarray(middle[..., :3]), np.ascontiguousarray(mask, dtype=np.float32)
-
-
 def _means(image: Floats, weight: Floats) -> Floats:
     return np.asarray(np.tensordot(weight, image, ((0, 1), (0, 1))), dtype=np.float32)
 
@@ -172,21 +150,13 @@ def _residual(
     return float(np.median(difference) / spread)
 
 
-def _slopes(image: Floats) -> tuple[Floats, Floats]:
-    """Derivatives to the right and down (h, w), central differences, 0 at the border."""
-    right, down = np.zeros_like(image), np.zeros_like(image)
-    right[:, 1:-1] = image[:, 2:] - image[:, :-2]
-    down[1:-1] = image[2:] - image[:-2]
-    return right, down
-
-
 def _grey(image: Floats) -> Floats:
     return np.asarray(image @ np.full(3, 1 / 3, np.float32))
 
 
 def _directions(image: Floats) -> Floats:
     """Twice the gradient's angle as (cosine, sine), shorter where the gradient is weak."""
-    right, down = _slopes(_grey(image))
+    right, down = slopes(_grey(image))
     size = np.hypot(right, down) + _GRADIENT_NOISE
     double = np.dstack([right * right - down * down, 2 * right * down])
     return np.asarray(double / (size * size)[..., None], dtype=np.float32)
@@ -199,7 +169,7 @@ def _edge_agreement(seen: Floats, reference: Reference) -> float:
 
 
 def _outline_share(seen: Floats, reference: Reference) -> float:
-    right, down = _slopes(_grey(seen))
+    right, down = slopes(_grey(seen))
     normal = reference.outline
     across = np.abs(right * normal[..., 0] + down * normal[..., 1])
     strength = np.hypot(normal[..., 0], normal[..., 1])

@@ -8,17 +8,23 @@ taught, and its result, the mask, is kept with the object.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+
+Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 
 PATCH_PX = 160
 HALF_PATCH_PX = PATCH_PX // 2
 # GrabCut works at half the resolution: as good there, in a quarter of the time.
 _SHRINK = 2
 _PROBABLE_RADIUS_PX = 50.0
-_LARGEST_RADIUS_PX = 62.0
+LARGEST_RADIUS_PX = 62.0
 _ITERATIONS = 4
 # A mask smaller than this share of the probable disk, or filling it, is a failed cut.
 _LEAST_SHARE, _LARGEST_SHARE = 0.03, 1.2
@@ -31,12 +37,23 @@ class Patch:
 
     image: NDArray[np.uint8]  # (160, 160, 3) BGR
     mask: NDArray[np.uint8]  # (160, 160), 255 on the object
+    # Of the object (x, y) in the patch, whose own middle is at 79.5.
+    center_px: tuple[float, float] = (float(HALF_PATCH_PX), float(HALF_PATCH_PX))
+    cut_out: bool = (
+        True  # else the mask is a disk, since the object could not be told from the table
+    )
 
     @property
     def span_px(self) -> tuple[float, float]:
         """Long and short side [px] of the mask's smallest rectangle."""
         _, size, _ = cv2.minAreaRect(cv2.findNonZero(self.mask))
         return float(max(size)), float(min(size))
+
+    @property
+    def radius_px(self) -> float:
+        """How far the mask reaches from the patch's middle."""
+        y, x = np.nonzero(self.mask)
+        return float(np.hypot(x - (PATCH_PX - 1) / 2, y - (PATCH_PX - 1) / 2).max())
 
 
 def cut_patch(frame: NDArray[np.uint8], center_px: tuple[float, float]) -> Patch:
@@ -46,32 +63,82 @@ def cut_patch(frame: NDArray[np.uint8], center_px: tuple[float, float]) -> Patch
     in its table's colours, the mask is a disk.
     """
     left, top = (round(value) - HALF_PATCH_PX for value in center_px)
-    pad = PATCH_PX
-    padded = cv2.copyMakeBorder(frame, pad, pad, pad, pad, cv2.BORDER_REFLECT_101)
-    window = padded[top + pad : top + pad + PATCH_PX, left + pad : left + pad + PATCH_PX]
-    image = np.ascontiguousarray(window, dtype=np.uint8)
-    return Patch(image, _object_mask(image))
+    image = np.ascontiguousarray(mirrored_square(frame, left, top, PATCH_PX))
+    found = _object_pixels(image)
+    cut_out = found is not None
+    small = _radii(PATCH_PX // _SHRINK) * _SHRINK < _FALLBACK_RADIUS_PX if found is None else found
+    mask = _grown(small)
+    return Patch(image, mask, (center_px[0] - left, center_px[1] - top), cut_out)
 
 
-def _object_mask(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def encode_patch(patch: Patch) -> bytes:
+    """Image and mask as a PNG with four channels."""
+    bgra = np.dstack([patch.image, patch.mask])
+    encoded = cv2.imencode(".png", bgra)[1]
+    return bytes(encoded)
+
+
+def decode_patch(data: bytes, path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Image (160, 160, 3) and mask (160, 160) of :func:`encode_patch`; `path` is for the message.
+
+    Raises:
+        QsgmError: it is something else.
+    """
+    try:
+        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        bgra = None
+    wanted = (PATCH_PX, PATCH_PX, 4)
+    if bgra is None or bgra.shape != wanted or bgra.dtype != np.uint8 or not bgra[..., 3].any():
+        raise QsgmError(
+            f"{path} is no patch of {PATCH_PX}x{PATCH_PX} px with a mask; tune the object again "
+            "with `qsgm finetune`"
+        )
+    image, mask = (np.ascontiguousarray(part, np.uint8) for part in (bgra[..., :3], bgra[..., 3]))
+    return image, mask
+
+
+def mirrored_square(image: Pixels, left: int, top: int, side: int) -> Pixels:
+    """A square of an image (h, w, 3), mirrored where it reaches over the border."""
+    height, width = image.shape[:2]
+    if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+        return image[top : top + side, left : left + side]
+    rows, cols = (
+        _reflected(first + np.arange(side), size) for first, size in ((top, height), (left, width))
+    )
+    return image[rows[:, None], cols]
+
+
+def _reflected(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Indices of a line mirrored at both ends, the end itself not repeated."""
+    period = max(2 * size - 2, 1)
+    folded = np.mod(index, period)
+    return np.asarray(np.minimum(folded, period - folded))
+
+
+def _object_pixels(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    """The object's pixels (80, 80) at half the resolution, None where it cannot be cut out."""
     side = PATCH_PX // _SHRINK
     small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
     radius = _radii(side) * _SHRINK
     trimap = np.full(radius.shape, cv2.GC_BGD, np.uint8)
-    trimap[radius < _LARGEST_RADIUS_PX] = cv2.GC_PR_BGD
+    trimap[radius < LARGEST_RADIUS_PX] = cv2.GC_PR_BGD
     trimap[radius < _PROBABLE_RADIUS_PX] = cv2.GC_PR_FGD
     models = np.zeros((2, 1, 65))
+    no_rectangle = (0, 0, 0, 0)
     # GrabCut draws the centres of its colour clusters from OpenCV's own generator.
     cv2.setRNGSeed(0)
-    no_rectangle = (0, 0, 0, 0)
     cv2.grabCut(
         small, trimap, no_rectangle, models[0], models[1], _ITERATIONS, cv2.GC_INIT_WITH_MASK
     )
     found = np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
     share = found.sum() / (radius < _PROBABLE_RADIUS_PX).sum()
-    if not _LEAST_SHARE < share < _LARGEST_SHARE:
-        found = radius < _FALLBACK_RADIUS_PX
-    grown = cv2.resize(255 * found.astype(np.uint8), (PATCH_PX, PATCH_PX))
+    return found if _LEAST_SHARE < share < _LARGEST_SHARE else None
+
+
+def _grown(small: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask (80, 80) at the patch's own resolution, 255 inside."""
+    grown = cv2.resize(255 * small.astype(np.uint8), (PATCH_PX, PATCH_PX))
     return np.asarray(255 * (grown > 127), dtype=np.uint8)
 
 
