@@ -4,8 +4,18 @@ frames          a folder of demonstrations, with or without a manifest
 accuracy        untouched, SGMs in int8 and float, backpropagation: same crops, same seed
 accuracy_report what that says: table and JSON
 layers          more and more layers tuned, or in blocks
-staging         scenes made from a demonstration: its object elsewhere, turned, relit, or gone
-scenes          teach on a frame, find the object in such scenes
+subjects        the objects that scenes are composed from: a folder's, or drawn ones
+cutouts         an object off its table, laid elsewhere with its shadow
+things          other things beside an object or over it
+surfaces        tables with an edge, a gap or a sheet in view
+lighting        a scene's light and camera
+composing       scenes in pairs, with the object and without it, in nine conditions
+judging         what answers to scenes are worth: outcomes, ROC, bootstrap intervals
+scenes          teach on a demonstration, look for its object in composed scenes
+rivals          other methods on the same scenes, a process each
+scenes_report   what was found, as JSON and tables
+scenes_picture  the same at a glance
+scenes_run      all of that in the order of the command
 fidelity        int8 gradients against float and true ones, on every frame
 calibration     calibration sets from far to near, judged on other frames
 step_jobs       training steps and forward passes to be timed

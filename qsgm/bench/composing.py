@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qsgm.bench.cutouts import CutOut, Frame, Mask, Point, Pose, cut_out, footprint, lay, pose_of
 from qsgm.bench.lighting import Camera, blurred_camera, dim_camera, mild_camera, photograph
 from qsgm.bench.surfaces import with_surface
-from qsgm.bench.things import TRIES, LaidThing, LooseThing, cover
+from qsgm.bench.things import TRIES, LaidThing, LooseThing, Target, cover
 from qsgm.crops import HALF_CROP_PX
 from qsgm.errors import QsgmError
 
@@ -134,10 +134,21 @@ class Composer:
             QsgmError: there is no subject of another kind to be the other thing.
         """
         layout = _LAYOUTS[condition](self, number, rng)
-        present = self._scene(layout, condition, self.cut(number))
         stand_in = self.cut(self._stranger(number, rng)) if rng.random() < 0.5 else None
+        painted = [self._painted(layout, cut) for cut in (self.cut(number), stand_in)]
+        taken, empty = photograph(painted, layout.camera)
+        place = layout.place
+        present = Scene(
+            frame=taken,
+            center_px=place.center_px,
+            turn_rad=place.turn_rad,
+            scale=place.scale,
+            condition=condition,
+            others=self._things_mask(layout, None),
+        )
         absent = replace(
-            self._scene(layout, condition, stand_in),
+            present,
+            frame=empty,
             center_px=None,
             others=self._things_mask(layout, stand_in),
             thing_instead=stand_in is not None,
@@ -151,21 +162,14 @@ class Composer:
             self._cuts[number] = cut_out(subject.frame, subject.mask, subject.center_px)
         return self._cuts[number]
 
-    def _scene(self, layout: _Layout, condition: Condition, cut: CutOut | None) -> Scene:
-        """The layout with this cut-out in the object's place."""
-        canvas, place = layout.table, layout.place
+    def _painted(self, layout: _Layout, cut: CutOut | None) -> NDArray[np.float32]:
+        """The layout (H, W, 3) with this cut-out in the object's place."""
+        canvas = layout.table
         if cut is not None:
-            canvas = lay(canvas, cut, place.pose(cut))
+            canvas = lay(canvas, cut, layout.place.pose(cut))
         for thing, pose in layout.things:
             canvas = lay(canvas, thing, pose)
-        return Scene(
-            frame=photograph(canvas, layout.camera),
-            center_px=place.center_px,
-            turn_rad=place.turn_rad,
-            scale=place.scale,
-            condition=condition,
-            others=self._things_mask(layout, None),
-        )
+        return canvas
 
     def _things_mask(self, layout: _Layout, stand_in: CutOut | None) -> Mask:
         """Pixels of all things that are not the object."""
@@ -176,6 +180,10 @@ class Composer:
         for thing, pose in things:
             covered |= footprint(thing, pose, self._frame_hw)
         return covered
+
+    def _covered(self, cut: CutOut, layout: _Layout) -> Mask:
+        """Pixels of a cut-out in the object's place."""
+        return footprint(cut, layout.place.pose(cut), self._frame_hw)
 
     def _table(self, number: int) -> NDArray[np.float32]:
         return self.cut(number).table.astype(np.float32)
@@ -215,14 +223,14 @@ class Composer:
         plain = self.same_table if rng.random() < 0.5 else self.another_table
         layout = plain(number, rng)
         cut = self.cut(number)
-        covered = footprint(cut, layout.place.pose(cut), self._frame_hw)
+        target = Target.of(self._covered(cut, layout), layout.place.center_px)
         things = []
         for _ in range(int(rng.integers(1, MOST_THINGS + 1))):
             thing = LooseThing.of(self.cut(self._stranger(number, rng)), rng)
             somewhere = rng.random() < SOMEWHERE_SHARE
-            center = thing.clear_of(covered, rng) if somewhere else None
+            center = thing.clear_of(target, rng) if somewhere else None
             if center is None:
-                center = thing.touching(covered, layout.place.center_px, rng)
+                center = thing.touching(target, rng)
             things.append(thing.at(center))
         return replace(layout, things=tuple(things))
 
@@ -230,7 +238,7 @@ class Composer:
         """A table's edge, a gap or a sheet near the object."""
         layout = self.same_table(number, rng)
         cut = self.cut(number)
-        covered = footprint(cut, layout.place.pose(cut), self._frame_hw)
+        covered = self._covered(cut, layout)
         other = self._table(self._another(number, rng))
         return replace(layout, table=with_surface(layout.table, other, covered, rng))
 
@@ -258,10 +266,10 @@ class Composer:
         """Another thing over 30 % of the object."""
         layout = self.same_table(number, rng)
         cut = self.cut(number)
-        covered = footprint(cut, layout.place.pose(cut), self._frame_hw)
+        target = Target.of(self._covered(cut, layout), layout.place.center_px)
         tries = ((self.cut(self._stranger(number, rng)), rng) for _ in range(TRIES))
-        things = (LooseThing.of(*drawn, larger=1 + k / 20) for k, drawn in enumerate(tries))
-        return replace(layout, things=(cover(covered, things, layout.place.center_px, rng),))
+        things = (LooseThing.of(*drawn, larger=1 + k / 10) for k, drawn in enumerate(tries))
+        return replace(layout, things=(cover(target, things, rng),))
 
 
 _LAYOUTS: dict[Condition, Callable[[Composer, int, np.random.Generator], _Layout]] = {

@@ -54,7 +54,8 @@ def cut_out(frame: Frame, mask: Mask, center_px: Point) -> CutOut:
     if not mask.any() or mask.all():
         raise QsgmError("a mask is all one colour: expected white on the object")
     table = empty_table(frame, grown(mask, REMOVED_MARGIN_PX))
-    alpha = np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), FEATHER_PX))
+    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), FEATHER_PX)
+    alpha = np.asarray(blurred, dtype=np.float32)
     x, y, w, h = cv2.boundingRect(grown(mask, SHADOW_MARGIN_PX + 2).astype(np.uint8))
     part = np.s_[y : y + h, x : x + w]
     return CutOut(

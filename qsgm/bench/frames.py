@@ -1,7 +1,8 @@
 """A folder of demonstration frames: those its manifest lists, or every picture in it.
 
 A manifest is a JSON list of objects, or an object with such a list as `frames`. Of each entry
-`file` is needed; `mask` (white where the object is), `object` and `elongated` are used if there.
+`file` is needed; `mask` (white where the object is), `object` (what it is), `elongated` and
+`orientation` (`unique`: it shows which way round it lies) are used if there.
 """
 
 import json
@@ -28,6 +29,8 @@ class BenchFrame:
     path: Path
     mask_path: Path | None
     elongated: bool | None  # None: nobody said
+    object_name: str | None = None
+    unique: bool | None = None  # whether it shows which way round it lies
 
     @property
     def name(self) -> str:
@@ -87,8 +90,16 @@ def _from_entry(folder: Path, manifest: Path, entry: Any) -> BenchFrame:
         raise QsgmError(f"{manifest}: expected frames with a key 'file', got {str(entry)[:80]}")
     path = folder / entry["file"]
     mask = folder / entry["mask"] if isinstance(entry.get("mask"), str) else _mask_beside(path)
-    elongated = entry.get("elongated")
-    return BenchFrame(path, mask, elongated if isinstance(elongated, bool) else None)
+    elongated, name, orientation = (
+        entry.get(key) for key in ("elongated", "object", "orientation")
+    )
+    return BenchFrame(
+        path,
+        mask,
+        elongated if isinstance(elongated, bool) else None,
+        name if isinstance(name, str) else None,
+        orientation == "unique" if isinstance(orientation, str) else None,
+    )
 
 
 def _from_pictures(folder: Path) -> list[BenchFrame]:

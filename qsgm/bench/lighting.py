@@ -1,5 +1,6 @@
 """Light and camera of a scene: brightness, tint, slope, contrast, blur, noise."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -45,19 +46,26 @@ def blurred_camera(rng: np.random.Generator) -> Camera:
     )
 
 
-def photograph(scene: Floats, camera: Camera) -> Frame:
-    """The scene (H, W, 3), 0 to 255, as a camera sees it."""
-    height, width = scene.shape[:2]
+def photograph(scenes: Sequence[Floats], camera: Camera) -> list[Frame]:
+    """Scenes (H, W, 3) of one size, 0 to 255, as a camera sees them: same light, same noise."""
+    height, width = scenes[0].shape[:2]
+    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)
+    side = x * np.cos(camera.from_side_rad) + y * np.sin(camera.from_side_rad)
+    light = (1 + camera.slope * side)[:, :, None] * np.array(camera.gain, dtype=np.float32)
+    rng = np.random.default_rng(camera.noise_seed)
+    noise = NOISE_LEVELS * rng.standard_normal(scenes[0].shape, dtype=np.float32)
+    return [_exposed(scene, camera, light, noise) for scene in scenes]
+
+
+def _exposed(scene: Floats, camera: Camera, light: Floats, noise: Floats) -> Frame:
+    """One scene in a light (H, W, 3), with noise (H, W, 3)."""
     seen = np.clip(scene, 0, 255)
     if camera.kernel is not None:
-        seen = np.asarray(cv2.filter2D(seen, -1, camera.kernel, borderType=cv2.BORDER_REFLECT_101))
-    y, x = np.mgrid[-0.5 : 0.5 : height * 1j, -0.5 : 0.5 : width * 1j]
-    side = x * np.cos(camera.from_side_rad) + y * np.sin(camera.from_side_rad)
-    light = np.asarray(camera.gain) * (1 + camera.slope * side)[:, :, None]
-    lit = 255 * (np.clip(seen, 0, 255) / 255.0) ** camera.gamma * light
-    noise = np.random.default_rng(camera.noise_seed).normal(0.0, NOISE_LEVELS, scene.shape)
-    rounded: Frame = np.clip(np.rint(lit + noise), 0, 255).astype(np.uint8)
-    return rounded
+        blurred = cv2.filter2D(seen, -1, camera.kernel, borderType=cv2.BORDER_REFLECT_101)
+        seen = np.clip(np.asarray(blurred, dtype=np.float32), 0, 255)
+    lit = 255 * cv2.pow(seen / np.float32(255), camera.gamma) * light + noise
+    return np.asarray(cv2.convertScaleAbs(np.maximum(lit, 0)), dtype=np.uint8)
 
 
 def _camera(

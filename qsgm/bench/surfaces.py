@@ -53,7 +53,7 @@ def _edge(table: Floats, floor: Floats, covered: Mask, rng: np.random.Generator)
     front = rng.uniform(0.0, 22.0)
     depth = beyond - front
     shadow = 1 - rng.uniform(0.2, 0.6) * np.exp(-np.maximum(depth, 0) / rng.uniform(10.0, 50.0))
-    below = floor * rng.uniform(0.35, 1.0) * shadow[:, :, None]
+    below = np.asarray(floor * rng.uniform(0.35, 1.0) * shadow[:, :, None], dtype=np.float32)
     edged = _mixed(table, table * rng.uniform(0.35, 0.8), beyond)
     return _mixed(edged, below, depth)
 
@@ -79,7 +79,8 @@ def _sheet(table: Floats, sheet: Floats, covered: Mask, rng: np.random.Generator
         inside = np.minimum(inside, -_beside(covered, along, rng).distance(table.shape))
     width = rng.uniform(2.0, 9.0)
     shadow = 1 - rng.uniform(0.0, 0.4) * np.exp(-np.maximum(-inside, 0) / width)
-    return _mixed(table * shadow[:, :, None], sheet, inside)
+    shaded = np.asarray(table * shadow[:, :, None], dtype=np.float32)
+    return _mixed(shaded, sheet, inside)
 
 
 def _line_beside(covered: Mask, rng: np.random.Generator) -> Line:

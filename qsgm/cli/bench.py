@@ -1,5 +1,6 @@
 """`qsgm bench`: what the README states, measured."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,11 +32,27 @@ from qsgm.cli.options import (
     settings_of,
     value_of,
 )
+from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
     from qsgm.bench.frames import BenchFrame
+    from qsgm.bench.rivals import Rival
 
 app = typer.Typer(help="Measure what the README states.")
+
+
+class SceneCondition(StrEnum):
+    """What is different in a scene."""
+
+    SAME_TABLE = "same_table"
+    ANOTHER_TABLE = "another_table"
+    BESIDE = "beside"
+    EDGES = "edges"
+    SCALE = "scale"
+    TILT = "tilt"
+    HALF_LIGHT = "half_light"
+    BLUR = "blur"
+    HIDDEN = "hidden"
 
 
 @app.command("accuracy")
@@ -120,30 +137,66 @@ def bench_layers(
 
 @app.command("scenes")
 def bench_scenes(
-    frames: FramesOption = None,
-    scenes: Annotated[int, typer.Option(min=1, max=1000, help="With the object, per frame.")] = 3,
+    frames: Annotated[
+        Path | None,
+        typer.Option(
+            "--frames", metavar="DIR", help="Demonstrations with masks; default: drawn by the seed."
+        ),
+    ] = None,
+    scenes: Annotated[
+        int, typer.Option(min=1, max=1000, help="Per object and condition, with it and without.")
+    ] = 3,
+    conditions: Annotated[
+        list[SceneCondition] | None,
+        typer.Option("--condition", help="Compose only these; repeatable. Else: all nine."),
+    ] = None,
     int8: PrecisionOption = None,
     method: MethodOption = MethodName.SGM,
     layers: LayersOption = defaults.LAYERS,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = defaults.EPOCHS,
-    limit: LimitOption = None,
+    epochs: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Passes over 800 crops; 0: untouched.")
+    ] = defaults.EPOCHS,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Look for at most so many of the objects.")
+    ] = None,
+    rivals: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rival", metavar="NAME=COMMAND", help="Another method's process; repeatable."
+        ),
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write all scenes here, and the truth.")
+    ] = None,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write some pictures here.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="Write scenes.png, scenes.json, failures/ here."
+        ),
     ] = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Teach on every frame, find its object in scenes made from it, and not on the empty table."""
-    from qsgm.bench.scenes import measure_scenes
+    """Teach on every frame, find its object in scenes composed from all, and only where it is.
 
-    some = frames_of(frames, limit)
+    Nine conditions, from the object's own table to an object a third of which is hidden, each
+    scene with the object and without it. Rivals look at the same scenes; how they are called,
+    `benchmarks/rivals` shows.
+    """
+    from qsgm.bench.composing import CONDITIONS
+    from qsgm.bench.scenes_run import SceneJob, run_scenes
+
+    parsed = tuple(parsed_rival(text) for text in rivals or [])
     settings = settings_of(int8, method, layers, optimizer, epochs, seed, None, threads)
+    loaded = open_bundle(bundle)
+    asked = tuple(name for name in CONDITIONS if name in (conditions or CONDITIONS))
+    job = SceneJob(frames, limit, asked, scenes, settings, loaded, parsed, keep, output)
     with progress() as watch:
-        report = measure_scenes(some, open_bundle(bundle), settings, scenes, watch, output)
-    show(report.to_json(), report.render(), as_json)
+        values, tables = run_scenes(job, watch)
+    show(values, tables, as_json)
 
 
 @app.command("speed")
@@ -398,3 +451,13 @@ def frames_of(folder: Path | None, limit: int | None) -> list["BenchFrame"]:
     from qsgm.bench.frames import list_frames
 
     return list_frames(paths.calibration_folder() if folder is None else folder, limit)
+
+
+def parsed_rival(text: str) -> "Rival":
+    """A rival's name and command, such as `ncc=python benchmarks/rivals/ncc.py`."""
+    from qsgm.bench.rivals import parse_rival
+
+    try:
+        return parse_rival(text)
+    except QsgmError as error:
+        raise typer.BadParameter(str(error), param_hint="'--rival'") from error
