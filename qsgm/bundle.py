@@ -16,8 +16,11 @@ from qsgm import defaults
 from qsgm.angles import ENCODINGS, AngleEncoding
 from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.defaults import MOST_LAYERS
+from qsgm.distractors import FILE as DISTRACTORS
+from qsgm.distractors import Distractors, load_distractors
 from qsgm.errors import QsgmError
 from qsgm.folded import FoldedConv, FoldedSgm
+from qsgm.grasp.decision import Decision
 from qsgm.quantize import ACTIVATION_BITS, LABELS, ActivationBits
 from qsgm.runtime import open_session
 from qsgm.tuning import short_run_factor
@@ -229,6 +232,21 @@ class Bundle:
             data[place["offset"] : place["offset"] + len(raw)] = raw
         return bytes(data)
 
+    def distractors(self) -> Distractors | None:
+        """The things to tell an object apart from; None in a bundle that was made without them."""
+        if DISTRACTORS not in self.manifest["files"]:
+            return None
+        return load_distractors((self.folder / DISTRACTORS).read_bytes())
+
+    def decision(self) -> Decision | None:
+        """What tells the object from others; None in a bundle that was made without it."""
+        found = self.manifest.get("decision")
+        return None if found is None else Decision.from_json(found, str(self.folder / MANIFEST))
+
+    def sha256(self) -> str:
+        """Of the manifest, and so of everything in it."""
+        return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
+
     def _initializer(self, data: bytes, name: str) -> NDArray[np.float32]:
         return _array_at(data, self.manifest["initializers"][name])
 
@@ -246,7 +264,7 @@ def load_bundle(folder: Path) -> Bundle:
     Raises:
         QsgmError: a file is missing or altered, or this is no bundle.
     """
-    manifest = read_manifest(folder, FORMAT, VERSION, COMMAND)
+    manifest = read_manifest(folder, FORMAT, (VERSION,), COMMAND)
     _check_manifest(folder / MANIFEST, manifest)
     for name, expected in manifest["files"].items():
         path = folder / name
@@ -260,7 +278,9 @@ def load_bundle(folder: Path) -> Bundle:
                 f"{path} is not the file the manifest describes (its sha256 differs); "
                 "export the bundle again with `qsgm fold-and-quantize`"
             )
-    return Bundle(folder, manifest)
+    bundle = Bundle(folder, manifest)
+    bundle.decision()  # a damaged one is refused here, not after a run
+    return bundle
 
 
 def needed_files(trunk: Precision, optimizer: OptimizerName, blocks: Sequence[str]) -> set[str]:
@@ -417,13 +437,13 @@ def require_keys(
             )
 
 
-def read_manifest(folder: Path, kind: str, version: int, command: str) -> dict[str, Any]:
+def read_manifest(folder: Path, kind: str, versions: Sequence[int], command: str) -> dict[str, Any]:
     """Read a folder's JSON description and check that it is of the expected kind.
 
     Args:
         folder: holds the description.
         kind: expected value of its key `format`.
-        version: expected value of its key `version`.
+        versions: expected values of its key `version`, the newest last.
         command: what the user runs to make such a folder.
 
     Raises:
@@ -439,8 +459,8 @@ def read_manifest(folder: Path, kind: str, version: int, command: str) -> dict[s
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, nested without end
         raise QsgmError(f"{path} is not JSON; make it again with `{command}`") from error
     got = (manifest.get("format"), manifest.get("version")) if isinstance(manifest, dict) else None
-    if got != (kind, version):
+    if got not in [(kind, version) for version in versions]:
         raise QsgmError(
-            f"{path} is of format {got}, expected {(kind, version)}; make it with `{command}`"
+            f"{path} is of format {got}, expected {(kind, versions[-1])}; make it with `{command}`"
         )
     return dict(manifest)

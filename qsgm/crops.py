@@ -133,12 +133,14 @@ def windows_of(wide: NDArray[np.uint8], plan: CropPlan) -> Iterator[NDArray[np.u
 
 
 def label_crops(
-    plan: CropPlan, offset_rad: float = 0.0, encoding: AngleEncoding = "double"
+    plan: CropPlan,
+    offset_rad: float | NDArray[np.float32] = 0.0,
+    encoding: AngleEncoding = "double",
 ) -> NDArray[np.float32]:
     """Labels (N, 3) of the planned crops: quality, sine and cosine; zeros for negatives.
 
     `offset_rad` is the demonstration's own orientation as the network sees it,
-    so that angles mean the same for every object.
+    so that angles mean the same for every object; one for each crop where there are several.
     """
     angle = encode_angle(plan.turn_rad + offset_rad, encoding)
     return np.concatenate([plan.quality[:, None], angle * plan.quality[:, None]], axis=1)

@@ -53,6 +53,8 @@ class Distractors:
     """(K, 128, 128, 4) BGR times opacity, opacity."""
     reach_px: NDArray[np.int32]
     """(K, 2) how far (x, y) the outermost visible pixels are from the middle, rounded up."""
+    named: int = 0
+    """How many of them, the last ones, the user named."""
 
     def __len__(self) -> int:
         return len(self.sprites)
@@ -122,7 +124,19 @@ def load_distractors(data: bytes) -> Distractors:
     bgra = rgba[..., [2, 1, 0, 3]]
     tiles = bgra.reshape(height // TILE_PX, TILE_PX, width // TILE_PX, TILE_PX, 4)
     sprites = np.ascontiguousarray(tiles.swapaxes(1, 2).reshape(-1, TILE_PX, TILE_PX, 4))
-    return Distractors(sprites, np.array([_reach(sprite) for sprite in sprites], np.int32))
+    return Distractors(sprites, _reaches(sprites))
+
+
+def with_named(things: Distractors | None, sprites: NDArray[np.uint8]) -> Distractors:
+    """Some things, if any, and behind them those that the user named: (K, 128, 128, 4)."""
+    named = Distractors(sprites, _reaches(sprites), len(sprites))
+    if things is None:
+        return named
+    return Distractors(
+        np.concatenate([things.sprites, sprites]),
+        np.concatenate([things.reach_px, named.reach_px]),
+        len(sprites),
+    )
 
 
 def plan_pastes(
@@ -329,6 +343,10 @@ def _packed(data: bytes) -> bytes:
             parts.append(body[4:])
         position += 12 + length
     return b"".join(parts)
+
+
+def _reaches(sprites: NDArray[np.uint8]) -> NDArray[np.int32]:
+    return np.array([_reach(sprite) for sprite in sprites], np.int32).reshape(-1, 2)
 
 
 def _reach(sprite: Layer) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Fine-tune on one demonstration: crops, features of the frozen layers, feed-forward training.
+"""Fine-tune on a demonstration: crops, features of the frozen layers, feed-forward training.
 
     frame = read_frame(Path("object.png"))
     result = finetune(frame, load_bundle(Path("export")))
@@ -9,24 +9,31 @@ one run of one method on it.
 """
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from qsgm import __version__
 from qsgm.blocks import Blocks, one_block
 from qsgm.bundle import Bundle, Precision, Recipe, step_file
 from qsgm.crops import TRAIN_CROPS
 from qsgm.drift import drift_warnings
 from qsgm.errors import QsgmError
 from qsgm.fidelity import LayerFidelity, mean_over_run
+from qsgm.grasp.likeness import likeness_of
+from qsgm.grasp.others import Other
 from qsgm.preparing import (
     STEPS_PER_EPOCH,
     Accuracy,
     Array,
+    Frames,
     Prepared,
     Watch,
     ignore,
@@ -46,6 +53,7 @@ from qsgm.settings import (
 )
 from qsgm.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.tuning import StepLoop, tune
+from qsgm.verdict import Verdict, verdict_on
 from qsgm.weights import to_conv_layout
 
 
@@ -121,24 +129,64 @@ class FinetuneResult:
         """The tuned object without a detour over the disk."""
         return TunedObject(self._description(name), self.network(), self.settings.threads)
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the object will be found and told apart."""
+        prepared = self.prepared
+        like = likeness_of(prepared.shown.patches[0])
+        trained = self.settings.epochs > 0
+        strength = prepared.offset_strength
+        return verdict_on(self.accuracy, self.zero_shot, strength, like, trained=trained)
+
     def _description(self, name: str) -> ObjectDescription:
-        return ObjectDescription(name, self.prepared.bundle.encoding, self.prepared.offset_rad)
+        prepared = self.prepared
+        return ObjectDescription(
+            name,
+            prepared.bundle.encoding,
+            prepared.offset_rad,
+            prepared.shown.scale,
+            prepared.shown.views(prepared.orientation.of_each_rad),
+            prepared.bundle.decision(),
+            self._made(),
+        )
+
+    def _made(self) -> dict[str, Any]:
+        """From what, by what: with the same of all this the same object comes out."""
+        return {
+            "qsgm": __version__,
+            "onnxruntime": ort.__version__,
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "bundle_sha256": self.prepared.bundle.sha256(),
+            "seed": self.prepared.settings.seed,
+            "frames_sha256": list(self.prepared.shown.sha256),
+            "others_sha256": list(self.prepared.others_sha256),
+        }
 
 
 def finetune(
-    frame: NDArray[np.uint8],
+    frames: Frames,
     bundle: Bundle,
     settings: Settings | None = None,
     watch: Watch | None = None,
+    others: Sequence[Other] = (),
 ) -> FinetuneResult:
-    """Tune the bundle's network to the object in a demonstration frame (H, W, 3) BGR.
+    """Tune the bundle's network to an object.
+
+    Args:
+        frames: a demonstration frame (H, W, 3) BGR, or several of the same object, of which the
+            first says what angle 0 is.
+        bundle: whose network is tuned.
+        settings: how.
+        watch: told about progress.
+        others: things to tell the object apart from.
 
     Raises:
         QsgmError: the object's window leaves the frame, the bundle cannot do what the settings
             ask for, or training diverged.
     """
     settings = settings or Settings()
-    return train(prepare(frame, bundle, settings, watch), settings, watch)
+    return train(prepare(frames, bundle, settings, watch, others), settings, watch)
 
 
 def train(

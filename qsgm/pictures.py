@@ -5,6 +5,7 @@ size; lengths that belong to the drawing are in units of 1/1280 of the canvas wi
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -35,10 +36,11 @@ _LABEL: Color = (170, 160, 155)
 _GOOD: Color = (120, 205, 110)
 _BAD: Color = (90, 95, 240)
 
-# Lengths of the gripper symbol, in frame pixels.
+# Lengths of the gripper symbol, in pixels that the network saw.
 _OPENING_PX = 76.0
 _FINGER_PX = 40.0
 _AXIS_PX = 62.0
+_BARB_PX = 11.0
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHIFT = 4  # fractional bits of OpenCV's sub-pixel drawing coordinates
@@ -52,6 +54,7 @@ class _Canvas:
     image: Picture  # (scale * H, scale * W, 3)
     scale: int  # canvas pixels per frame pixel
     unit: float  # canvas pixels per drawing unit
+    reach: float  # frame pixels per pixel that the network saw
 
     def at(self, frame_xy: Point) -> Point:
         """Where a point of the frame [px] lies on the canvas."""
@@ -62,7 +65,11 @@ class _Canvas:
 
 
 def draw_detection(
-    frame: Picture, heatmap: NDArray[np.float32], detection: Detection, title: str
+    frame: Picture,
+    heatmap: NDArray[np.float32],
+    detection: Detection,
+    title: str,
+    instances: Sequence[Detection] = (),
 ) -> Picture:
     """Draw what was found, where, how far to move and how far to turn.
 
@@ -71,34 +78,43 @@ def draw_detection(
         heatmap: (3, rows, cols) as :func:`qsgm.predict.locate` took it; channel 0 is shown.
         detection: what it found.
         title: one line over the values, such as the object's name.
+        instances: everything that is to be shown as found, if it is more than that.
 
     Returns:
         (H', W', 3) BGR: the enlarged frame with a caption below; W' is at least 1280.
     """
-    canvas = _enlarge(frame, dim=not detection.found)
+    canvas = _enlarge(frame, 1 / detection.scale, dim=not detection.found)
     _draw_heat(canvas, heatmap[0])
+    for other in instances:
+        if other.center_px != detection.center_px:
+            _draw_window(canvas, other.center_px)
+            _draw_gripper(canvas, other)
     if detection.found:
         _draw_window(canvas, detection.center_px)
         _draw_move(canvas, _middle(frame), detection.center_px)
-        _draw_gripper(canvas, detection.center_px, math.radians(detection.angle_deg))
+        _draw_turn(canvas, canvas.at(detection.center_px), math.radians(_turn_deg(detection)))
+        _draw_gripper(canvas, detection)
     else:
         _draw_guess(canvas, detection.center_px)
-    return np.concatenate([canvas.image, _caption(canvas, detection, title)])
+    found = max(len(instances), int(detection.found))
+    return np.concatenate([canvas.image, _caption(canvas, detection, title, found)])
 
 
-def _enlarge(frame: Picture, *, dim: bool) -> _Canvas:
+def _enlarge(frame: Picture, reach: float, *, dim: bool) -> _Canvas:
     scale = max(1, math.ceil(CANVAS_WIDTH_PX / frame.shape[1]))
     image = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     if dim:
         grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
         image = cv2.addWeighted(grey, 0.7, np.zeros_like(grey), 0.3, 0)
-    return _Canvas(np.asarray(image, dtype=np.uint8), scale, image.shape[1] / CANVAS_WIDTH_PX)
+    return _Canvas(
+        np.asarray(image, dtype=np.uint8), scale, image.shape[1] / CANVAS_WIDTH_PX, reach
+    )
 
 
 def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32]) -> None:
     """Lay the quality (rows, cols) over the canvas where it is notable, with a line at 0.5."""
     height, width = canvas.image.shape[:2]
-    step, first = CELL_PX * canvas.scale, HALF_CROP_PX * canvas.scale
+    step, first = (side * canvas.scale * canvas.reach for side in (CELL_PX, HALF_CROP_PX))
     cell_of_pixel = np.array([[1 / step, 0, -first / step], [0, 1 / step, -first / step]])
     smooth = cv2.warpAffine(
         np.asarray(quality, dtype=np.float32),
@@ -121,10 +137,10 @@ def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32]) -> None:
 
 def _draw_window(canvas: _Canvas, center: Point) -> None:
     """Corners of the 128x128 window that the network saw there."""
-    arm = 14.0
+    arm, half = 14.0 * canvas.reach, HALF_CROP_PX * canvas.reach
     for right in (-1, 1):
         for down in (-1, 1):
-            x, y = center[0] + right * HALF_CROP_PX, center[1] + down * HALF_CROP_PX
+            x, y = center[0] + right * half, center[1] + down * half
             corner = [(x - right * arm, y), (x, y), (x, y - down * arm)]
             _line(canvas, [canvas.at(point) for point in corner], _GRIPPER, 2)
 
@@ -149,30 +165,39 @@ def _draw_move(canvas: _Canvas, start: Point, end: Point) -> None:
     _line(canvas, [left, head, right], _MOVE, 3)
 
 
-def _draw_gripper(canvas: _Canvas, center: Point, angle_rad: float) -> None:
-    """Two finger bars and the axis they close along; at angle 0 that axis is horizontal."""
-    x, y = canvas.at(center)
+def _draw_gripper(canvas: _Canvas, found: Detection) -> None:
+    """Two finger bars and the axis they close along; at angle 0 that axis is horizontal.
+
+    Where the full turn is known, an arrow shows what was the right-hand side when it was taught.
+    """
+    x, y = canvas.at(found.center_px)
+    angle_rad, grown = math.radians(_turn_deg(found)), canvas.scale * canvas.reach
 
     def place(along: float, across: float) -> Point:
-        """Lengths in frame pixels along and across the axis; counter-clockwise is up here."""
+        """Lengths in the network's pixels along and across the axis; counter-clockwise is up."""
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-        return (
-            x + canvas.scale * (along * cos + across * sin),
-            y + canvas.scale * (across * cos - along * sin),
-        )
+        return x + grown * (along * cos + across * sin), y + grown * (across * cos - along * sin)
 
-    _draw_turn(canvas, (x, y), angle_rad)
     _line(canvas, [place(-_AXIS_PX, 0), place(_AXIS_PX, 0)], _GRIPPER, 2)
+    if found.full_angle_deg is not None:
+        head = [place(_AXIS_PX - _BARB_PX, side * 0.6 * _BARB_PX) for side in (-1, 1)]
+        _line(canvas, [head[0], place(_AXIS_PX, 0), head[1]], _GRIPPER, 3)
     for side in (-_OPENING_PX / 2, _OPENING_PX / 2):
         _line(canvas, [place(side, -_FINGER_PX / 2), place(side, _FINGER_PX / 2)], _GRIPPER, 8)
     _dot(canvas, (x, y), 5, _GRIPPER)
 
 
+def _turn_deg(found: Detection) -> float:
+    """Over the full circle where that is known."""
+    return found.angle_deg if found.full_angle_deg is None else found.full_angle_deg
+
+
 def _draw_turn(canvas: _Canvas, center: Point, angle_rad: float) -> None:
     """A dashed line where the axis was in the demonstration, and an arc from there to here."""
     x, y = center
-    radius = (_AXIS_PX - 6) * canvas.scale
-    dashes = np.linspace(0, _AXIS_PX * canvas.scale, 16)
+    grown = canvas.scale * canvas.reach
+    radius = (_AXIS_PX - 6) * grown
+    dashes = np.linspace(0, _AXIS_PX * grown, 16)
     for start, end in zip(dashes[0::2], dashes[1::2], strict=True):
         _line(canvas, [(x + start, y), (x + end, y)], _HEAT, 2)
     turns = np.linspace(0, angle_rad, 40)
@@ -184,7 +209,7 @@ def _draw_guess(canvas: _Canvas, center: Point) -> None:
     """A quiet ring where the quality was highest, though not high enough."""
     x, y = canvas.at(center)
     turns = np.linspace(0, 2 * math.pi, 97)
-    radius = CROP_PX / 4 * canvas.scale
+    radius = CROP_PX / 4 * canvas.scale * canvas.reach
     for start in range(0, 96, 8):
         arc = [
             (x + radius * math.cos(t), y + radius * math.sin(t)) for t in turns[start : start + 5]
@@ -192,13 +217,13 @@ def _draw_guess(canvas: _Canvas, center: Point) -> None:
         _line(canvas, arc, _BAD, 2)
 
 
-def _caption(canvas: _Canvas, detection: Detection, title: str) -> Picture:
+def _caption(canvas: _Canvas, detection: Detection, title: str, found: int) -> Picture:
     """The panel below the frame: title, verdict and the four values."""
     width, unit = canvas.image.shape[1], canvas.unit
     panel = np.full((round(_PANEL_HEIGHT * unit), width, 3), _PANEL, dtype=np.uint8)
     accent = _GOOD if detection.found else _BAD
     panel[:, : round(10 * unit)] = accent
-    verdict = "found" if detection.found else "NOT FOUND"
+    verdict = (f"{found} found" if found > 1 else "found") if detection.found else "NOT FOUND"
     verdict_width = _text_width(verdict, unit * 0.85, bold=True)
     _text(panel, verdict, (width - 36 * unit - verdict_width, 44 * unit), unit * 0.85, accent, True)
     room = width - 110 * unit - verdict_width
@@ -219,7 +244,8 @@ def _values(detection: Detection) -> list[tuple[str, str]]:
         return [("best guess at", f"{x:.0f}, {y:.0f} px"), ("move", "-"), ("turn", "-"), quality]
     # Adding 0.0 turns a rounded -0.0 into 0.0.
     right, down = (round(value, 1) + 0.0 for value in detection.displacement_px)
-    turn = round_degrees(detection.angle_deg, 1)
+    full = detection.full_angle_deg
+    turn = round_degrees(detection.angle_deg, 1) if full is None else round(full, 1) + 0.0
     return [
         ("centre (x, y)", f"{x:.1f}, {y:.1f} px"),
         ("move (right, down)", f"{right:+.1f}, {down:+.1f} px"),

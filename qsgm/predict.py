@@ -1,5 +1,8 @@
 """From a heatmap to one grasp: where the object is, how far to move, how far to turn.
 
+This is the network's own answer. Where a tuned object has a patch of its demonstration, that has
+the last word (:mod:`qsgm.grasp.finding`).
+
 A heatmap has one cell per 128x128 window of the frame, 16 px apart. The network was taught to
 answer "yes" within 4 px of the object's centre and "no" from 28 px on, so an object makes a blob
 one to three cells wide. The centre is the quality-weighted mean of the 3x3 cells around the
@@ -10,6 +13,7 @@ two cells the centre lies, so cutting off the rest moves the mean by a pixel or 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +32,19 @@ _AS_GOOD = 0.9
 _EPSILON = 1e-9
 
 
+RefinedBy = Literal["patch", "network"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an object may be."""
+
+    center_px: tuple[float, float]  # (x, y) in the frame
+    quality: float  # in [0, 1]
+    angle_deg: float  # turn since the demonstration, in (-90, 90], counter-clockwise positive
+    full_angle_deg: float | None = None  # the same in (-180, 180], where it is known
+
+
 @dataclass(frozen=True)
 class Detection:
     """The one object in a frame. When not `found`, the other fields describe the best guess."""
@@ -37,6 +54,11 @@ class Detection:
     center_px: tuple[float, float]  # (x, y) in the frame
     displacement_px: tuple[float, float]  # (x, y) from the frame's centre; right and down positive
     angle_deg: float  # turn since the demonstration, in (-90, 90], counter-clockwise positive
+    full_angle_deg: float | None = None  # the same in (-180, 180], where it is known
+    full_angle_confidence: float | None = None  # that it is not the opposite, in [0, 1]
+    refined_by: RefinedBy = "network"  # whence centre and angle are
+    scale: float = 1.0  # what the frame was scaled by for the network
+    candidates: tuple[Place, ...] = ()  # where else it may be, best first; this one is the first
 
 
 def locate(

@@ -1,12 +1,12 @@
-"""One demonstration as the tuned layers see it: crops, features, labels, the untouched accuracy.
+"""An object as the tuned layers see it: crops, features, labels, the untouched accuracy.
 
 What all methods share is done once, so that they can be compared on the very same crops.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 
 from qsgm.angles import angle_error, decode_angle, mean_direction
 from qsgm.bundle import COMMAND, Bundle, head_file, trunk_file
-from qsgm.crops import (
-    TRAIN_CROPS,
-    CropPlan,
-    cut_widened,
-    label_crops,
-    plan_crops,
-    widened,
-)
+from qsgm.crops import TRAIN_CROPS, label_crops
+from qsgm.grasp.clutter import Addition
+from qsgm.grasp.others import Other, add_others
+from qsgm.grasp.shown import Shown, shown
+from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.runtime import running
 from qsgm.settings import Settings, run_blocks, trunk_precision
 from qsgm.tuning import BATCH, Features
@@ -29,6 +26,9 @@ from qsgm.weights import to_step_layout
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
+Frame = NDArray[np.uint8]
+# One frame with the object at its centre, or some that show it anywhere.
+Frames = Frame | Sequence[Frame | Demonstration]
 # (stage, how much of it is done, out of how much)
 Watch = Callable[[str, int, int], None]
 # Crops that are in memory at once. With more the frozen layers in float take much of it, and are no
@@ -45,6 +45,11 @@ class Accuracy:
 
     detection_accuracy: float  # share of crops on the right side of 0.5
     angle_mae_deg: float  # modulo 180 degrees, over positives
+    # The same over the crops that show the frame as it is, with nothing put on them.
+    detection_accuracy_plain: float | None = None
+    angle_mae_deg_plain: float | None = None
+    # Share of the crops with another thing at their middle that are not taken for the object.
+    told_apart: float | None = None
 
 
 class FeatureSource(Protocol):
@@ -74,18 +79,17 @@ class KeptFeatures:
 
 
 class StreamedFeatures:
-    """Made again whenever they are asked for: kept are the frame and the plan of the crops."""
+    """Made again whenever they are asked for: kept are the frames and the plan of the crops."""
 
     def __init__(
         self,
-        frame: NDArray[np.uint8],  # (H, W, 3)
-        plan: CropPlan,
+        crops: CropSource,
         bundle: Bundle,
         settings: Settings,
         seconds: MutableMapping[str, float],  # crops, features: what they take is added there
     ) -> None:
         name = trunk_file(trunk_precision(settings, bundle), settings.layers)
-        self._frame, self._plan, self._bundle, self._seconds = widened(frame), plan, bundle, seconds
+        self._crops, self._bundle, self._seconds = crops, bundle, seconds
         self._session = bundle.session(name, settings.threads)
         (output,) = self._session.get_outputs()
         self._shape = tuple(output.shape[1:])
@@ -97,7 +101,7 @@ class StreamedFeatures:
         for first in range(0, len(rows), SLICE):
             some = slice(first, min(first + SLICE, len(rows)))
             with _adding_to(self._seconds, "crops"):
-                crops = cut_widened(self._frame, self._plan[rows[some]])
+                crops = self._crops.cut(rows[some])
             with _adding_to(self._seconds, "features"), running_graphs(self._bundle):
                 features[some] = self._session.run(["features"], {"crops": crops})[0]
             if watch is not None:
@@ -109,19 +113,40 @@ class StreamedFeatures:
 
 
 @dataclass(frozen=True)
+class Orientation:
+    """How demonstrations lie as the untouched network sees them."""
+
+    offset_rad: float  # of the first one
+    strength: float  # 1: all its crops agree on it, 0: there is none (a round object)
+    of_each_rad: tuple[float, ...]  # of every demonstration
+
+
+@dataclass(frozen=True)
 class Prepared:
-    """One demonstration as the tuned layers see it."""
+    """An object as the tuned layers see it."""
 
     bundle: Bundle
     settings: Settings
+    shown: Shown
     source: FeatureSource
     labels: Array  # (N, 3)
     angle_rad: NDArray[np.float64]  # (N,) of the labels, the offset included
-    offset_rad: float  # the demonstration's orientation as the untouched network sees it
-    offset_strength: float  # 1: all crops agree on it, 0: there is none (a round object)
+    addition: NDArray[np.uint8]  # (N,) of Addition: what was put on each crop
+    orientation: Orientation
     start: dict[str, Array]  # weights and biases, in the step graphs' layout
     zero_shot: Accuracy
     seconds: dict[str, float]  # crops, features, total
+    others_sha256: tuple[str, ...] = ()  # of the things that it is to be told apart from
+
+    @property
+    def offset_rad(self) -> float:
+        """The demonstration's orientation as the untouched network sees it."""
+        return self.orientation.offset_rad
+
+    @property
+    def offset_strength(self) -> float:
+        """How much its crops agree on that, 0 to 1."""
+        return self.orientation.strength
 
     @property
     def features(self) -> Features:
@@ -135,48 +160,104 @@ class Prepared:
 
 
 def prepare(
-    frame: NDArray[np.uint8], bundle: Bundle, settings: Settings, watch: Watch | None = None
+    frames: Frames,
+    bundle: Bundle,
+    settings: Settings,
+    watch: Watch | None = None,
+    others: Sequence[Other] = (),
 ) -> Prepared:
     """Crops, features, labels and what the untouched network makes of them.
 
-    Of the settings only `layers`, `trunk`, `seed`, `center_px`, `stream` and `threads` matter here;
-    the others are checked.
+    Args:
+        frames: one frame (H, W, 3) BGR with the object at its centre, or at the settings'; or
+            several of the same object.
+        bundle: whose network it is.
+        settings: only `layers`, `trunk`, `seed`, `center_px`, `span_px`, `stream` and `threads`
+            matter here; the others are checked.
+        watch: told about progress.
+        others: things to tell the object apart from, beside the bundle's.
+
+    Raises:
+        QsgmError: the object's window leaves the frame, the object fills it, or the bundle cannot
+            do what the settings ask for.
     """
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-        raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+    demonstrations = as_demonstrations(frames, settings)
     bundle.check_blocks(run_blocks(settings))
     began = time.perf_counter()
-    height, width = frame.shape[:2]
-    center = settings.center_px or (width / 2, height / 2)
-    plan = plan_crops((height, width), center, np.random.default_rng(settings.seed))
+    seen = shown(demonstrations, settings.span_px)
+    things = add_others(bundle.distractors(), others, seen.scale)
+    crops = crop_source(seen.demonstrations, things, np.random.default_rng(settings.seed))
     seconds = {"crops": 0.0, "features": 0.0}
-    source = feature_source(frame, plan, bundle, settings, seconds, watch or ignore)
+    source = feature_source(crops, bundle, settings, seconds, watch or ignore)
     start = in_step_layout(bundle.start_weights(settings.layers))
-    outputs = answers(source, np.arange(len(plan)), start, bundle, settings)
-    seen = decode_angle(outputs[:, 1], outputs[:, 2], bundle.encoding)
-    # Validation crops have no say in it.
-    positive = np.flatnonzero(plan.quality[:TRAIN_CROPS] > 0)
-    offset, strength = mean_direction(seen[positive] - plan.turn_rad[positive])
-    labels = label_crops(plan, offset, bundle.encoding)
-    angle = plan.turn_rad.astype(np.float64) + offset
+    outputs = answers(source, np.arange(len(crops)), start, bundle, settings)
+    orientation = orientation_of(outputs, crops, seen.turns_rad, bundle)
+    offset = np.array(orientation.of_each_rad)[crops.shown]
+    labels = label_crops(crops.plan, offset.astype(np.float32), bundle.encoding)
+    angle = crops.plan.turn_rad + offset
+    addition, held_out = crops.addition, slice(TRAIN_CROPS, None)
+    zero_shot = accuracy_on(
+        outputs[held_out], labels[held_out], angle[held_out], addition[held_out], bundle
+    )
+    # What is streamed later is part of other stages.
+    seconds = seconds | {"total": time.perf_counter() - began}
     return Prepared(
         bundle,
         settings,
+        seen,
         source,
         labels,
         angle,
-        offset,
-        strength,
+        addition,
+        orientation,
         start,
-        accuracy_of(outputs[TRAIN_CROPS:], labels[TRAIN_CROPS:], angle[TRAIN_CROPS:], bundle),
-        # What is streamed later is part of other stages.
-        seconds | {"total": time.perf_counter() - began},
+        zero_shot,
+        seconds,
+        tuple(other.sha256 for other in others),
     )
 
 
+def as_demonstrations(frames: Frames, settings: Settings) -> list[Demonstration]:
+    """Frames, each with where its object is: at the settings' centre, else at its own."""
+    some = [frames] if isinstance(frames, np.ndarray) else list(frames)
+    if not some:
+        raise ValueError("`frames` must hold at least one frame")
+    found = []
+    for one in some:
+        frame = one.frame if isinstance(one, Demonstration) else one
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+        center = settings.center_px or (frame.shape[1] / 2, frame.shape[0] / 2)
+        found.append(one if isinstance(one, Demonstration) else Demonstration(frame, center))
+    return found
+
+
+def orientation_of(
+    outputs: Array, crops: CropSource, turns_rad: Sequence[float | None], bundle: Bundle
+) -> Orientation:
+    """What the untouched network's outputs (N, 3) say of the demonstrations.
+
+    Where the patch says how far the object is turned since the first one (`turns_rad`), the crops
+    of both say together how they lie; the others' speak for themselves.
+    """
+    known = np.array([0.0 if turn is None else turn for turn in turns_rad])
+    alike = np.array([turn is not None for turn in turns_rad])
+    seen = decode_angle(outputs[:, 1], outputs[:, 2], bundle.encoding)
+    lying = seen - crops.plan.turn_rad - known[crops.shown]
+    # Validation crops have no say in it.
+    taught = (crops.plan.quality > 0) & (np.arange(len(crops)) < TRAIN_CROPS)
+    offset, strength = mean_direction(lying[taught & alike[crops.shown]])
+    of_each = [
+        offset + known[number]
+        if alike[number]
+        else mean_direction(lying[taught & (crops.shown == number)])[0]
+        for number in range(len(turns_rad))
+    ]
+    return Orientation(offset, strength, tuple(of_each))
+
+
 def feature_source(
-    frame: NDArray[np.uint8],
-    plan: CropPlan,
+    crops: CropSource,
     bundle: Bundle,
     settings: Settings,
     seconds: MutableMapping[str, float],
@@ -184,21 +265,20 @@ def feature_source(
 ) -> FeatureSource:
     """Features of the planned crops, kept or streamed as the settings say."""
     if settings.stream:
-        return StreamedFeatures(frame, plan, bundle, settings, seconds)
-    return KeptFeatures(see(frame, plan, bundle, settings, seconds, watch))
+        return StreamedFeatures(crops, bundle, settings, seconds)
+    return KeptFeatures(see(crops, bundle, settings, seconds, watch))
 
 
 def see(
-    frame: NDArray[np.uint8],
-    plan: CropPlan,
+    crops: CropSource,
     bundle: Bundle,
     settings: Settings,
     seconds: MutableMapping[str, float],
     watch: Watch,
 ) -> Features:
     """Features (N, P, C) of all planned crops."""
-    made = StreamedFeatures(frame, plan, bundle, settings, seconds)
-    return made.of(np.arange(len(plan)), watch)
+    made = StreamedFeatures(crops, bundle, settings, seconds)
+    return made.of(np.arange(len(crops)), watch)
 
 
 def answers(
@@ -229,11 +309,33 @@ def accuracy_of(
     return Accuracy(float(np.mean(detected == positive)), float(np.mean(error)))
 
 
+def accuracy_on(
+    outputs: Array,
+    labels: Array,
+    angle_rad: NDArray[np.float64],
+    addition: NDArray[np.uint8],
+    bundle: Bundle,
+) -> Accuracy:
+    """:func:`accuracy_of`, with and without the crops (N,) that something was put on."""
+    whole = accuracy_of(outputs, labels, angle_rad, bundle)
+    plain = addition == Addition.NOTHING
+    as_it_is = accuracy_of(outputs[plain], labels[plain], angle_rad[plain], bundle)
+    thing = (addition == Addition.THING) & (labels[:, 0] == 0)
+    told = np.mean(outputs[thing, 0] <= DETECTION_THRESHOLD) if thing.any() else None
+    return replace(
+        whole,
+        detection_accuracy_plain=as_it_is.detection_accuracy,
+        angle_mae_deg_plain=as_it_is.angle_mae_deg,
+        told_apart=None if told is None else float(told),
+    )
+
+
 def validate(prepared: Prepared, weights: Mapping[str, Array], settings: Settings) -> Accuracy:
     """Weights, in the step graphs' layout, on the crops that took no part in training."""
     rows = np.arange(TRAIN_CROPS, len(prepared.labels))
     outputs = answers(prepared.source, rows, weights, prepared.bundle, settings)
-    return accuracy_of(outputs, prepared.labels[rows], prepared.angle_rad[rows], prepared.bundle)
+    known = prepared.labels[rows], prepared.angle_rad[rows], prepared.addition[rows]
+    return accuracy_on(outputs, *known, prepared.bundle)
 
 
 def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:

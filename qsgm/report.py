@@ -17,11 +17,13 @@ from rich.text import Text
 
 from qsgm.angles import round_degrees
 from qsgm.fidelity import LayerFidelity
-from qsgm.predict import Detection
+from qsgm.grasp.finding import full_degrees
+from qsgm.predict import Detection, Place
 
 if TYPE_CHECKING:
     from qsgm.finetuning import FinetuneResult
     from qsgm.preparing import Accuracy
+    from qsgm.verdict import Verdict
 
 FIDELITY_LEGEND = (
     "means over the run; cos: cosine of int8, float and true gradients; norm ratio: |int8|/|true|; "
@@ -68,6 +70,12 @@ def angle(value_deg: float, digits: int) -> float | None:
     return round_degrees(value_deg, digits) if math.isfinite(value_deg) else None
 
 
+def full_angle(turn_rad: float) -> float:
+    """A turn in degrees, rounded, in (-180, 180]."""
+    rounded = round(full_degrees(turn_rad), 2) + 0.0
+    return 180.0 if rounded <= -180.0 else rounded
+
+
 def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str, Any]:
     """The stable keys of `qsgm finetune`, then the others."""
     settings = result.settings
@@ -93,7 +101,21 @@ def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str
         "rates": list(result.recipe.rates_over(result.steps)),
         "orientation_deg": angle(math.degrees(result.prepared.offset_rad), 2),
         "orientation_strength": number(result.prepared.offset_strength, 3),
-        "warnings": list(result.warnings),
+        **shown_json(result),
+        "verdict": result.verdict.to_json(),
+        "warnings": [*result.warnings, *result.verdict.reasons],
+    }
+
+
+def shown_json(result: "FinetuneResult") -> dict[str, Any]:
+    """What was shown of the object."""
+    shown, others = result.prepared.shown, result.prepared.others_sha256
+    turns = [None if turn is None else full_angle(turn) for turn in shown.turns_rad]
+    return {
+        "scale": number(shown.scale, 5),
+        "span_px": None if shown.span_px is None else number(shown.span_px, 1),
+        "demonstrations": [{"turn_deg": turn} for turn in turns],
+        "others": len(others),
     }
 
 
@@ -117,26 +139,67 @@ def fidelity_command_json(result: "FinetuneResult", name: str) -> dict[str, Any]
 
 
 def predict_json(
-    detection: Detection, heatmap_shape: Sequence[int], name: str, output: Path | None
+    detection: Detection,
+    heatmap_shape: Sequence[int],
+    name: str,
+    output: Path | None,
+    instances: Sequence[Detection] | None = None,
 ) -> dict[str, Any]:
-    """The stable keys of `qsgm predict`, then the others."""
+    """The stable keys of `qsgm predict`, then the others; `objects` where all were asked for."""
+    objects = {} if instances is None else {"objects": [object_json(one) for one in instances]}
     return {
         "object": name,
-        "quality": number(detection.quality, 4),
-        "center_px": [number(value, 2) for value in detection.center_px],
-        "displacement_px": [number(value, 2) for value in detection.displacement_px],
-        "angle_deg": angle(detection.angle_deg, 2),
+        **object_json(detection),
         "heatmap_shape": [int(side) for side in heatmap_shape],
         "found": detection.found,
+        "scale": number(detection.scale, 5),
+        "candidates": [place_json(place) for place in detection.candidates],
+        **objects,
         "output": None if output is None else str(output),
     }
 
 
-def accuracy_json(accuracy: "Accuracy") -> dict[str, float | None]:
-    """Detection and angle."""
+def object_json(detection: Detection) -> dict[str, Any]:
+    """One object of a scene."""
+    confidence = detection.full_angle_confidence
     return {
-        "detection_accuracy": number(accuracy.detection_accuracy, 4),
-        "angle_mae_deg": number(accuracy.angle_mae_deg, 3),
+        "quality": number(detection.quality, 4),
+        "center_px": [number(value, 2) for value in detection.center_px],
+        "displacement_px": [number(value, 2) for value in detection.displacement_px],
+        "angle_deg": angle(detection.angle_deg, 2),
+        "full_angle_deg": full_angle_json(detection.full_angle_deg),
+        "full_angle_confidence": None if confidence is None else number(confidence, 4),
+        "refined_by": detection.refined_by,
+    }
+
+
+def place_json(place: Place) -> dict[str, Any]:
+    """A place where the object may be."""
+    return {
+        "center_px": [number(value, 2) for value in place.center_px],
+        "quality": number(place.quality, 4),
+        "angle_deg": angle(place.angle_deg, 2),
+        "full_angle_deg": full_angle_json(place.full_angle_deg),
+    }
+
+
+def full_angle_json(angle_deg: float | None) -> float | None:
+    """A turn over the full circle, if it is known."""
+    return None if angle_deg is None else full_angle(math.radians(angle_deg))
+
+
+def accuracy_json(accuracy: "Accuracy") -> dict[str, float | None]:
+    """Detection and angle, with other things on the crops and without, and what was told apart."""
+    values = {
+        "detection_accuracy": (accuracy.detection_accuracy, 4),
+        "angle_mae_deg": (accuracy.angle_mae_deg, 3),
+        "detection_accuracy_plain": (accuracy.detection_accuracy_plain, 4),
+        "angle_mae_deg_plain": (accuracy.angle_mae_deg_plain, 3),
+        "told_apart": (accuracy.told_apart, 4),
+    }
+    return {
+        key: None if value is None else number(value, digits)
+        for key, (value, digits) in values.items()
     }
 
 
@@ -163,8 +226,21 @@ def seconds_json(seconds: Mapping[str, float]) -> dict[str, float | None]:
 def finetune_report(result: "FinetuneResult", name: str) -> RenderableType:
     """Before and after, fidelity, seconds, and whatever there is to say."""
     return Group(
-        before_after_table(result, name), fidelity_report(result), seconds_line(result.seconds)
+        before_after_table(result, name),
+        fidelity_report(result),
+        *verdict_lines(result.verdict),
+        seconds_line(result.seconds),
     )
+
+
+def verdict_lines(verdict: "Verdict") -> list[Text]:
+    """What to expect of the object, why, and what to do."""
+    style = "bold green" if verdict.good else "bold yellow"
+    return [
+        Text(f"verdict: {verdict.headline}", style=style),
+        *(Text(f"  {reason}", style="yellow") for reason in verdict.reasons),
+        *(Text(f"  {note}") for note in verdict.notes),
+    ]
 
 
 def fidelity_report(result: "FinetuneResult") -> RenderableType:
@@ -203,8 +279,11 @@ def before_after_table(result: "FinetuneResult", name: str) -> Table:
     table.add_column("200 validation crops")
     table.add_column("detection", justify="right")
     table.add_column("angle error", justify="right")
+    table.add_column("others told apart", justify="right")
     for label, accuracy in (("untouched", result.zero_shot), ("tuned", result.accuracy)):
-        table.add_row(label, f"{accuracy.detection_accuracy:.3f}", f"{accuracy.angle_mae_deg:.1f}°")
+        told = "-" if accuracy.told_apart is None else f"{accuracy.told_apart:.3f}"
+        detection, error = accuracy.detection_accuracy, accuracy.angle_mae_deg
+        table.add_row(label, f"{detection:.3f}", f"{error:.1f}°", told)
     return table
 
 
@@ -258,8 +337,31 @@ def detection_table(detection: Detection, name: str) -> RenderableType:
     table.add_row("quality", f"{detection.quality:.2f}")
     table.add_row("centre", f"{x:.1f}, {y:.1f} px")
     table.add_row("move", f"{right:+.1f} px right, {down:+.1f} px down")
-    table.add_row("turn", f"{round_degrees(detection.angle_deg, 1):+.1f}° counter-clockwise")
+    table.add_row("turn", turn_text(detection))
     return table
+
+
+def instances_table(instances: Sequence[Detection], name: str) -> RenderableType:
+    """Every instance that was found, a row each."""
+    if not instances:
+        return Text(f"{name}: not found", style="bold red")
+    table = plain_table(f"{name}: {len(instances)} found")
+    for header in ("quality", "centre", "move right, down", "turn"):
+        table.add_column(header, justify="right")
+    for one in instances:
+        (x, y), (right, down) = one.center_px, (value + 0.0 for value in one.displacement_px)
+        move = f"{right:+.1f}, {down:+.1f} px"
+        table.add_row(f"{one.quality:.2f}", f"{x:.1f}, {y:.1f} px", move, turn_text(one))
+    return table
+
+
+def turn_text(detection: Detection) -> str:
+    """Over the full circle where that is known."""
+    if detection.full_angle_deg is None:
+        turn = round_degrees(detection.angle_deg, 1)
+        return f"{turn:+.1f}° counter-clockwise, or the opposite"
+    full = round(detection.full_angle_deg, 1) + 0.0
+    return f"{180.0 if full <= -180.0 else full:+.1f}° counter-clockwise"
 
 
 def plain_table(title: str | None) -> Table:

@@ -23,6 +23,7 @@ class Settings:
     stream: bool = False  # make crops and features again for every batch, keep none
     seed: int = 0
     center_px: tuple[float, float] | None = None  # of the object; None: the frame's centre
+    span_px: float | None = None  # long side of the object in the first frame; None: measured
     threads: int = 1
     probe_every: int = defaults.PROBE_EVERY  # steps from one look at the gradients to the next
 

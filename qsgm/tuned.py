@@ -1,9 +1,16 @@
-"""A tuned object: a folder with a stand-alone ONNX network, how to read it, and the report."""
+"""A tuned object: a folder with a stand-alone ONNX network, how to read it, and the report.
+
+Beside the network lie the demonstration's patch, by which places that the network proposes are
+judged, and all that tells how the object was made. Folders of version 1 have no patch: they are
+read as ever, and the network alone says where the object is.
+"""
 
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +19,34 @@ from numpy.typing import NDArray
 
 from qsgm.angles import ENCODINGS, AngleEncoding
 from qsgm.bundle import NETWORK, read_manifest, require_keys
+from qsgm.crops import CROP_PX
 from qsgm.errors import QsgmError
 from qsgm.files import new_folder
-from qsgm.predict import Detection, locate, refine
+from qsgm.grasp.candidates import candidate_cells
+from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
+from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
+from qsgm.grasp.judge import JUDGED, cell_center
+from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame
+from qsgm.grasp.others import Other
+from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
+from qsgm.grasp.shown import View
+from qsgm.predict import Detection, Place, locate, refine
 from qsgm.runtime import open_session, running
 
 FORMAT = "qsgm-object"
-VERSION = 1
+VERSIONS = (1, 2)
 DESCRIPTION = "object.json"
 REPORT = "report.json"
+PATCH = "patch.png"
+FOUND_FROM = 0.5
+# Without a decision the patch moves a detection only where it fits as well as that.
+STRONG_CORRELATION = 0.7
+# Two places of the network that are closer are of the same object.
+_APART_PX = 48.0
 _COMMAND = "qsgm finetune -o DIR"
 _ADVICE = "tune the object again with `qsgm finetune`"
 _KEYS: dict[str, type] = {"name": str, "encoding": str, "offset_rad": float, "sha256": str}
+_NEW_KEYS: dict[str, type] = {"scale": float, "views": list, "made": dict}
 
 
 @dataclass(frozen=True)
@@ -33,6 +56,10 @@ class ObjectDescription:
     name: str
     encoding: AngleEncoding
     offset_rad: float  # orientation of the demonstration as the network sees it
+    scale: float = 1.0  # what frames are scaled by before the network sees them
+    views: tuple[View, ...] = ()  # none in an object of version 1
+    decision: Decision | None = None
+    made: Mapping[str, Any] = field(default_factory=dict)  # from what, by what
 
 
 class TunedObject:
@@ -50,7 +77,7 @@ class TunedObject:
             )
 
     def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """A frame (H, W, 3) to quality, sine and cosine (3, rows, cols)."""
+        """A frame (H, W, 3) at the object's scale to quality, sine and cosine (3, rows, cols)."""
         with running(f"the object {self.description.name!r}", _ADVICE):
             heatmap: NDArray[np.float32] = self._session.run(["heatmap"], {"frame": frame})[0]
         return heatmap
@@ -58,15 +85,123 @@ class TunedObject:
     def locate(self, frame: NDArray[np.uint8]) -> tuple[Detection, NDArray[np.float32]]:
         """Where the object is in a frame (H, W, 3), and the heatmap that says so.
 
-        The heatmap finds it, a second and closer look says where exactly and how far turned.
+        The network proposes places, what the object looked like decides between them and says where
+        exactly and how far turned it is. Everything is in the frame's own pixels.
         """
-        heatmap = self.heatmap(frame)
-        height, width = frame.shape[:2]
-        how = self.description.offset_rad, self.description.encoding
-        coarse = locate(heatmap, (height, width), *how)
-        if not coarse.found:
-            return coarse, heatmap
-        return refine(coarse, frame, self.heatmap, *how), heatmap
+        seen = self._seen(frame)
+        heatmap = self.heatmap(seen)
+        best, *others = self._detections(seen, heatmap, JUDGED)
+        best = self._refined(best, seen)
+        places = tuple(_as_place(one) for one in (best, *others))
+        return self._in_frame(replace(best, candidates=places), seen, frame), heatmap
+
+    def locate_all(self, frame: NDArray[np.uint8]) -> list[Detection]:
+        """Every instance of the object in a frame (H, W, 3), the surest first."""
+        seen = self._seen(frame)
+        found = self._detections(seen, self.heatmap(seen), MOST_INSTANCES)
+        refined = [self._refined(one, seen) for one in found if one.found]
+        return [self._in_frame(one, seen, frame) for one in refined]
+
+    def as_other(self) -> Other:
+        """What it looks like, for another object to be told apart from it.
+
+        Raises:
+            QsgmError: the object is of version 1, which does not know.
+        """
+        about = self.description
+        if not about.views:
+            raise QsgmError(
+                f"{about.name!r} was tuned by a version of qsgm that kept no picture of it; "
+                f"{_ADVICE}, or pass a frame of it"
+            )
+        return Other(about.views[0].patch, about.scale)
+
+    @cached_property
+    def _finder(self) -> Finder | None:
+        """None in an object without a patch."""
+        about = self.description
+        if not about.views:
+            return None
+        return Finder(about.views, about.offset_rad, about.encoding)
+
+    def _seen(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The frame at the object's scale.
+
+        Raises:
+            QsgmError: less than a window is left of it.
+        """
+        seen = scaled_frame(frame, self.description.scale)
+        if min(seen.shape[:2]) < CROP_PX:
+            (height, width), (seen_height, seen_width) = frame.shape[:2], seen.shape[:2]
+            raise QsgmError(
+                f"a frame of {width}x{height} px has {seen_width}x{seen_height} at the scale of "
+                f"{self.description.name!r}: expected at least {CROP_PX} on each side; take it as "
+                "the object's demonstration was taken"
+            )
+        return seen
+
+    def _detections(
+        self, seen: NDArray[np.uint8], heatmap: NDArray[np.float32], count: int
+    ) -> list[Detection]:
+        """The best places first, at least one, none of them refined by the network yet."""
+        coarse = self._at(heatmap, seen)
+        decision = self.description.decision
+        if self._finder is None or decision is None:
+            return [coarse, *self._further(coarse, seen, heatmap, count)]
+        sightings = self._finder.find(seen, heatmap, decision, count)
+        return [_as_detection(one) for one in sightings]
+
+    def _further(
+        self,
+        coarse: Detection,
+        seen: NDArray[np.uint8],
+        heatmap: NDArray[np.float32],
+        count: int,
+    ) -> list[Detection]:
+        """What else the network sees, apart from its best place."""
+        places = [coarse]
+        for cell in candidate_cells(heatmap[0], count):
+            center = cell_center(cell)
+            if all(math.dist(center, place.center_px) >= _APART_PX for place in places):
+                places.append(self._at(_around(heatmap, cell), seen))
+        return places[1:]
+
+    def _at(self, heatmap: NDArray[np.float32], seen: NDArray[np.uint8]) -> Detection:
+        height, width = seen.shape[:2]
+        about = self.description
+        return locate(heatmap, (height, width), about.offset_rad, about.encoding, FOUND_FROM)
+
+    def _refined(self, place: Detection, seen: NDArray[np.uint8]) -> Detection:
+        """A closer look by the network where the patch had none, or none worth the name."""
+        if not place.found or place.refined_by == "patch":
+            return place
+        about = self.description
+        closer = refine(place, seen, self.heatmap, about.offset_rad, about.encoding)
+        if self._finder is None or about.decision is not None:
+            return closer
+        laid = self._finder.lay(seen, closer.center_px)
+        return _moved(closer, laid) if laid.fit.score >= STRONG_CORRELATION else closer
+
+    def _in_frame(
+        self, place: Detection, seen: NDArray[np.uint8], frame: NDArray[np.uint8]
+    ) -> Detection:
+        """A place of the scaled frame in the frame's own pixels."""
+        seen_hw, frame_hw = seen.shape[:2], frame.shape[:2]
+        places = place.candidates
+        center = place.center_px
+        if seen_hw != frame_hw:
+            center = moved_point(center, seen_hw, frame_hw)
+            places = tuple(
+                replace(one, center_px=moved_point(one.center_px, seen_hw, frame_hw))
+                for one in places
+            )
+        return replace(
+            place,
+            center_px=center,
+            displacement_px=(center[0] - frame_hw[1] / 2, center[1] - frame_hw[0] / 2),
+            scale=self.description.scale,
+            candidates=places,
+        )
 
 
 def save_object(
@@ -77,10 +212,17 @@ def save_object(
     Raises:
         QsgmError: the folder cannot be written, or holds something else.
     """
-    head = {"format": FORMAT, "version": VERSION, "sha256": hashlib.sha256(network).hexdigest()}
+    patches = {
+        PATCH if number == 1 else f"patch_{number}.png": encode_patch(view.patch)
+        for number, view in enumerate(description.views, start=1)
+    }
+    head = {"format": FORMAT, "version": VERSIONS[-1], "sha256": _sha256(network)}
     with new_folder(folder, DESCRIPTION) as new:
         (new / NETWORK).write_bytes(network)
-        (new / DESCRIPTION).write_text(json.dumps(head | asdict(description), indent=1) + "\n")
+        for name, data in patches.items():
+            (new / name).write_bytes(data)
+        values = head | _to_json(description, patches)
+        (new / DESCRIPTION).write_text(json.dumps(values, indent=1) + "\n")
         (new / REPORT).write_text(json.dumps(report, indent=1) + "\n")
 
 
@@ -90,8 +232,9 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     Raises:
         QsgmError: it is missing, altered, or something else.
     """
-    manifest = read_manifest(folder, FORMAT, VERSION, _COMMAND)
-    require_keys(folder / DESCRIPTION, manifest, _KEYS, _COMMAND)
+    manifest = read_manifest(folder, FORMAT, VERSIONS, _COMMAND)
+    first = manifest["version"] == VERSIONS[0]
+    require_keys(folder / DESCRIPTION, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
     description = ObjectDescription(manifest["name"], manifest["encoding"], manifest["offset_rad"])
     if description.encoding not in ENCODINGS or not math.isfinite(description.offset_rad):
         raise QsgmError(
@@ -99,6 +242,116 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
             f"offset_rad, got {description.encoding!r} and {description.offset_rad}; {_ADVICE}"
         )
     path = folder / NETWORK
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != manifest["sha256"]:
+    if not path.is_file() or _sha256(path.read_bytes()) != manifest["sha256"]:
         raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    if not first:
+        description = _with_looks(description, folder, manifest)
     return TunedObject(description, path, threads)
+
+
+def _to_json(about: ObjectDescription, patches: Mapping[str, bytes]) -> dict[str, Any]:
+    decision = about.decision
+    return {
+        "name": about.name,
+        "encoding": about.encoding,
+        "offset_rad": about.offset_rad,
+        "scale": about.scale,
+        "views": [
+            {
+                "file": name,
+                "sha256": _sha256(data),
+                "center_px": list(view.patch.center_px),
+                "cut_out": view.patch.cut_out,
+                "turn_rad": view.turn_rad,
+                "whole": view.whole,
+            }
+            for view, (name, data) in zip(about.views, patches.items(), strict=True)
+        ],
+        "decision": None if decision is None else decision.to_json(),
+        "threshold": {
+            "quality": FOUND_FROM,
+            "false_alarm_rate": None if decision is None else FALSE_ALARM_RATE,
+        },
+        "made": dict(about.made),
+    }
+
+
+def _with_looks(
+    description: ObjectDescription, folder: Path, manifest: Mapping[str, Any]
+) -> ObjectDescription:
+    """What an object of version 2 says beyond one of version 1.
+
+    Raises:
+        QsgmError: a patch is missing or altered, or the description says nonsense.
+    """
+    path = folder / DESCRIPTION
+    decision = manifest.get("decision")
+    try:
+        views = tuple(_view(folder, one) for one in manifest["views"])
+        scale = float(manifest["scale"])
+        sane = 0 < scale <= MOST_ENLARGED and all(math.isfinite(one.turn_rad) for one in views)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        sane = False
+    if not sane:
+        raise QsgmError(f"{path}: 'views' or 'scale' is damaged; {_ADVICE}")
+    return replace(
+        description,
+        scale=scale,
+        views=views,
+        decision=None if decision is None else Decision.from_json(decision, str(path)),
+        made=manifest["made"],
+    )
+
+
+def _view(folder: Path, entry: Mapping[str, Any]) -> View:
+    path = folder / str(entry["file"])
+    if path.parent != folder or not path.is_file() or _sha256(path.read_bytes()) != entry["sha256"]:
+        raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    x, y = (float(value) for value in entry["center_px"])
+    if not (0 <= x <= PATCH_PX and 0 <= y <= PATCH_PX):
+        raise ValueError(f"`center_px` must lie in the patch, got {(x, y)}")
+    image, mask = decode_patch(path.read_bytes(), path)
+    patch = Patch(image, mask, (x, y), bool(entry["cut_out"]))
+    return View(patch, float(entry["turn_rad"]), bool(entry["whole"]))
+
+
+def _as_detection(sighting: Sighting) -> Detection:
+    """By the patch, or, where that is weak, the place that the network is to look at again."""
+    nothing = Detection(
+        sighting.quality >= FOUND_FROM,
+        sighting.quality,
+        sighting.cell_px if sighting.weak else sighting.center_px,
+        (0.0, 0.0),
+        sighting.angle_deg,
+    )
+    return nothing if sighting.weak else _moved(nothing, sighting)
+
+
+def _moved(place: Detection, sighting: Sighting) -> Detection:
+    """The same place with centre and turn as the patch lies there."""
+    return replace(
+        place,
+        center_px=sighting.center_px,
+        angle_deg=sighting.angle_deg,
+        full_angle_deg=sighting.full_angle_deg,
+        full_angle_confidence=sighting.confidence,
+        refined_by="patch",
+    )
+
+
+def _as_place(found: Detection) -> Place:
+    return Place(found.center_px, found.quality, found.angle_deg, found.full_angle_deg)
+
+
+def _around(heatmap: NDArray[np.float32], cell: tuple[int, int]) -> NDArray[np.float32]:
+    """A heatmap (3, rows, cols) with no quality but around a cell."""
+    row, col = cell
+    near = slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+    alone = heatmap.copy()
+    alone[0] = 0
+    alone[0][near] = heatmap[0][near]
+    return alone
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

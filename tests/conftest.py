@@ -23,6 +23,7 @@ from qsgm.folded import FoldedSgm, float_trace
 from qsgm.images import write_png
 from qsgm.quantize import QuantizedSgm, SgmRanges, quantize_sgm
 from qsgm.train.calibration_set import Demonstration
+from qsgm.train.draw_distractors import encode_sheet
 from qsgm.train.export import build_trunks, bundle_files
 from qsgm.train.fold import FoldedNet, fold_net, fold_sgm
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
@@ -121,6 +122,14 @@ def draw_frame(length: int = 90) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     return np.clip(table, 0, 255).astype(np.uint8), np.where(mask > 127, 255, 0).astype(np.uint8)
 
 
+def draw_things() -> NDArray[np.uint8]:
+    """A sheet of two things, a green bar and a blue disk: (128, 256, 4) BGRA."""
+    sheet = np.zeros((128, 256, 4), np.uint8)
+    cv2.rectangle(sheet, (24, 52), (104, 76), (60, 200, 40, 255), cv2.FILLED)
+    cv2.circle(sheet, (192, 64), 30, (220, 90, 30, 255), cv2.FILLED)
+    return sheet
+
+
 def write_bundle(folder: Path) -> None:
     """Every graph a bundle holds, and the manifest."""
     torch.manual_seed(0)
@@ -143,6 +152,7 @@ def write_bundle(folder: Path) -> None:
         step = step_model(net, blocks, precisions[precision], loss, OPTIMIZERS[name])
         models[bundles.step_file(precision, name, blocks)] = step
     files, sgms = bundle_files(models, int8_sgms, float_sgms)
+    files[bundles.DISTRACTORS] = encode_sheet(draw_things())
     for file, data in files.items():
         (folder / file).write_bytes(data)
     manifest = _manifest(folder, net, loss) | {"sgms": sgms}
@@ -180,7 +190,7 @@ def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
         },
         "files": {
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-            for path in sorted([*folder.glob("*.onnx"), folder / bundles.WEIGHTS])
+            for path in sorted(folder.iterdir())
         },
     }
 

@@ -14,8 +14,9 @@ from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object, prep
 from qsgm.angles import encode_angle
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, Precision, head_file
-from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
+from qsgm.crops import CROPS, TRAIN_CROPS
 from qsgm.finetuning import FinetuneResult, peak_activation_bytes, train
+from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.preparing import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
 from qsgm.quantize import SgmRanges, constants, quantize_sgm
 from qsgm.report import finetune_json, to_json
@@ -25,6 +26,17 @@ from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]
 SHORT = Settings(precision="int8", epochs=2)
+
+
+def planned(
+    frame: Frame,
+    bundle: Bundle,
+    center_px: tuple[float, float] = (320.0, 240.0),
+    count: int = CROPS,
+) -> CropSource:
+    """The crops of a run with seed 0."""
+    shown = Demonstration(frame, center_px)
+    return crop_source([shown], bundle.distractors(), np.random.default_rng(0), count)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +66,7 @@ def test_another_seed_gives_other_crops(
 def test_crops_cut_in_slices_have_the_features_of_crops_cut_at_once(
     frame: Frame, bundle: Bundle, result: FinetuneResult
 ) -> None:
-    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
-    crops = cut_crops(frame, plan[:60])
+    crops = planned(frame, bundle).cut(np.arange(60))
     expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
     assert len(result.prepared.features) == CROPS
     np.testing.assert_allclose(result.prepared.features[:60], expected, atol=1e-5)
@@ -65,8 +76,7 @@ def test_the_frozen_layers_run_in_the_precision_asked_for(
     frame: Frame, bundle: Bundle, result: FinetuneResult
 ) -> None:
     prepared = prepare(frame, bundle, replace(SHORT, trunk="int8"))
-    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
-    crops = cut_crops(frame, plan[:20])
+    crops = planned(frame, bundle).cut(np.arange(20))
     expected = bundle.session("trunk_int8_3.onnx").run(None, {"crops": crops})[0]
     np.testing.assert_array_equal(prepared.features[:20], expected)
     assert not np.array_equal(prepared.features, result.prepared.features)
@@ -75,17 +85,18 @@ def test_the_frozen_layers_run_in_the_precision_asked_for(
 
 def test_the_object_may_lie_elsewhere_in_the_frame(frame: Frame, bundle: Bundle) -> None:
     prepared = prepare(frame, bundle, replace(SHORT, center_px=(250.0, 280.0)))
-    plan = plan_crops((480, 640), (250, 280), np.random.default_rng(0))
-    crops = cut_crops(frame, plan[:20])
+    crops = planned(frame, bundle, (250.0, 280.0)).cut(np.arange(20))
     expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
     np.testing.assert_allclose(prepared.features[:20], expected, atol=1e-5)
     with pytest.raises(QsgmError, match="closer than 64 px to the border"):
         prepare(frame, bundle, replace(SHORT, center_px=(30.0, 240.0)))
 
 
-def test_labels_are_shifted_by_the_orientation_the_network_sees(result: FinetuneResult) -> None:
+def test_labels_are_shifted_by_the_orientation_the_network_sees(
+    frame: Frame, result: FinetuneResult
+) -> None:
     prepared = result.prepared
-    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
+    plan = planned(frame, prepared.bundle).plan
     positive = plan.quality > 0
     expected = encode_angle(plan.turn_rad + np.float32(prepared.offset_rad))
     np.testing.assert_allclose(prepared.labels[positive, 1:], expected[positive], atol=1e-5)
@@ -136,7 +147,7 @@ def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers 1 to 3 see large maps."""
     for module in (preparing, probing, finetuning):
         monkeypatch.setattr(module, "TRAIN_CROPS", 64)
-    monkeypatch.setattr(preparing, "plan_crops", partial(plan_crops, count=96))
+    monkeypatch.setattr(preparing, "crop_source", partial(crop_source, count=96))
 
 
 @pytest.mark.usefixtures("few_crops")
@@ -172,8 +183,7 @@ def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
     assert untouched.network() == (bundle.folder / "network.onnx").read_bytes()
     result.save(tmp_path / "mug", "mug")
     tuned = load_object(tmp_path / "mug")
-    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 96)
-    crops = cut_crops(frame, plan[:5])
+    crops = planned(frame, bundle, count=96).cut(np.arange(5))
     np.testing.assert_array_equal(result.prepared.features[:5].reshape(crops.shape), crops)
     weights = {
         name: to_step_layout(value) if value.ndim > 1 else value
@@ -204,7 +214,7 @@ def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
 def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
     frame: Frame, bundle: Bundle, settings: Settings, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preparing, "plan_crops", pytest.fail)
+    monkeypatch.setattr(preparing, "crop_source", pytest.fail)
     with pytest.raises(QsgmError, match=said) as raised:
         finetune(frame, bundle, settings)
     assert "\n" not in str(raised.value)
@@ -229,11 +239,10 @@ def test_no_epochs_leave_the_network_as_it_was(frame: Frame, bundle: Bundle) -> 
 
 
 def test_the_tuned_network_answers_like_the_head_with_the_final_weights(
-    frame: Frame, result: FinetuneResult, tmp_path: Path
+    frame: Frame, bundle: Bundle, result: FinetuneResult, tmp_path: Path
 ) -> None:
     result.save(tmp_path / "mug", "mug")
-    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
-    crops = cut_crops(frame, plan[TRAIN_CROPS : TRAIN_CROPS + 20])
+    crops = planned(frame, bundle).cut(np.arange(TRAIN_CROPS, TRAIN_CROPS + 20))
     weights = {
         name: to_step_layout(value) if value.ndim > 1 else value
         for name, value in result.weights.items()

@@ -1,5 +1,6 @@
 """The commands themselves; those of `bench` are in :mod:`qsgm.cli.bench`."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,23 +23,28 @@ from qsgm.cli.options import (
     BundleOption,
     CalibratorName,
     CenterOption,
+    CentersOption,
     Device,
     Encoding,
     EpochsOption,
     FrameArgument,
+    FramesArgument,
     JsonOption,
     MethodName,
     MethodOption,
     OptimizerOption,
+    OthersOption,
     PrecisionOption,
     RecalibrateOption,
     ReportOption,
     SceneArgument,
     SeedOption,
+    SpanOption,
     StreamOption,
     ThreadsOption,
     TrunkOption,
     parsed_blocks,
+    parsed_centers,
     parsed_channels,
     settings_of,
     tuned_layers,
@@ -48,6 +54,8 @@ from qsgm.errors import QsgmError
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
     from qsgm.finetuning import FinetuneResult
+    from qsgm.grasp.others import Other
+    from qsgm.grasp.source import Demonstration
     from qsgm.settings import Settings
 
 app = typer.Typer()
@@ -157,7 +165,7 @@ def slim(
 
 @app.command()
 def finetune(
-    frame: FrameArgument,
+    frames: FramesArgument,
     int8: PrecisionOption = None,
     method: MethodOption = MethodName.SGM,
     layers: Annotated[
@@ -176,7 +184,9 @@ def finetune(
     recalibrate: RecalibrateOption = False,
     stream: StreamOption = False,
     seed: SeedOption = 0,
-    center: CenterOption = None,
+    center: CentersOption = None,
+    span: SpanOption = None,
+    others: OthersOption = None,
     bundle: BundleOption = None,
     output: Annotated[
         Path | None,
@@ -185,22 +195,23 @@ def finetune(
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Tune the network to the object in one frame, on the device."""
+    """Tune the network to the object in one frame or several, on the device."""
     from qsgm.files import check_replaceable
     from qsgm.report import finetune_json, finetune_report
     from qsgm.tuned import DESCRIPTION
 
-    tuned = tuned_layers(layers, blocks)
+    tuned, first = tuned_layers(layers, blocks), frames[0]
+    centers = parsed_centers(center, len(frames))
     settings = settings_of(
-        int8, method, tuned, optimizer, epochs, seed, center, threads, blocks, trunk
+        int8, method, tuned, optimizer, epochs, seed, None, threads, blocks, trunk
     )
     if recalibrate and int8 is None and settings.method == "sgm":
         settings = replace(settings, precision="int8")  # those are the SGMs that have ranges
-    settings = replace(settings, recalibrate=recalibrate, stream=stream)
-    folder = paths.object_folder(frame) if output is None else output
+    settings = replace(settings, recalibrate=recalibrate, stream=stream, span_px=span)
+    folder = paths.object_folder(first) if output is None else output
     check_replaceable(folder, DESCRIPTION)
-    result = _finetune(frame, open_bundle(bundle), settings)
-    name = folder.name if output is None else frame.stem
+    result = _finetune(frames, centers, others or (), open_bundle(bundle), settings)
+    name = folder.name if output is None else first.stem
     report = finetune_json(result, name, folder)
     result.save(folder, name)
     _remember(folder, chosen=output is not None)
@@ -216,6 +227,9 @@ def predict(
         Path | None,
         typer.Option("--object", metavar="DIR", help="Tuned object; default: the last one."),
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="List every instance of the object.")
+    ] = False,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,
@@ -225,17 +239,22 @@ def predict(
     """Find the tuned object: where it is, how far to move, how far to turn."""
     from qsgm.images import read_frame, write_png
     from qsgm.pictures import draw_detection
-    from qsgm.report import detection_table, predict_json
+    from qsgm.report import detection_table, instances_table, predict_json
     from qsgm.tuned import load_object
 
     found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
     frame = read_frame(scene)
     detection, heatmap = found.locate(frame)
+    instances = found.locate_all(frame) if everything else None
     name = found.description.name
     if output is not None:
-        write_png(output, draw_detection(frame, heatmap, detection, name))
-    report = predict_json(detection, heatmap.shape, name, output)
-    show(report, detection_table(detection, name), as_json)
+        picture = draw_detection(frame, heatmap, detection, name, instances or ())
+        write_png(output, picture)
+    report = predict_json(detection, heatmap.shape, name, output, instances)
+    table = (
+        detection_table(detection, name) if instances is None else instances_table(instances, name)
+    )
+    show(report, table, as_json)
     if output is not None and not as_json:
         typer.echo(f"picture: {output}")
 
@@ -273,7 +292,8 @@ def fidelity(
     settings = settings_of(
         int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads, trunk=trunk
     )
-    result = _finetune(frame, open_bundle(bundle), replace(settings, probe_every=every))
+    settings = replace(settings, probe_every=every)
+    result = _finetune([frame], [settings.center_px], (), open_bundle(bundle), settings)
     if not result.probes:
         raise QsgmError(
             f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
@@ -288,13 +308,36 @@ def fidelity(
         typer.echo(f"picture: {picture}")
 
 
-def _finetune(frame: Path, bundle: "Bundle", settings: "Settings") -> "FinetuneResult":
+def _finetune(
+    frames: Sequence[Path],
+    centers: Sequence[tuple[float, float] | None],
+    others: Sequence[Path],
+    bundle: "Bundle",
+    settings: "Settings",
+) -> "FinetuneResult":
     from qsgm.finetuning import finetune as run_finetune
+
+    demonstrations = [_demonstration(*one) for one in zip(frames, centers, strict=True)]
+    named = [_other(path) for path in others]
+    with progress() as watch:
+        return run_finetune(demonstrations, bundle, settings, watch, named)
+
+
+def _demonstration(path: Path, center_px: tuple[float, float] | None) -> "Demonstration":
+    """A frame with its object at a point, or at its centre."""
+    from qsgm.grasp.source import Demonstration
     from qsgm.images import read_demonstration
 
-    demonstration = read_demonstration(frame)
-    with progress() as watch:
-        return run_finetune(demonstration, bundle, settings, watch)
+    frame = read_demonstration(path)
+    return Demonstration(frame, center_px or (frame.shape[1] / 2, frame.shape[0] / 2))
+
+
+def _other(path: Path) -> "Other":
+    """A thing to tell the object apart from: what a frame shows, or a tuned object."""
+    from qsgm.grasp.others import other_in
+    from qsgm.tuned import load_object
+
+    return load_object(path).as_other() if path.is_dir() else other_in(_demonstration(path, None))
 
 
 def _remember(folder: Path, *, chosen: bool) -> None:

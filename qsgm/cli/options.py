@@ -76,6 +76,35 @@ class Device(StrEnum):
 FrameArgument = Annotated[
     Path, typer.Argument(metavar="OBJECT.PNG", help="One frame with the object at its centre.")
 ]
+FramesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="OBJECT.PNG...",
+        help="Frames with the object at their centre; the first is angle 0.",
+    ),
+]
+OthersOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--not",
+        metavar="IMAGE|OBJECT",
+        help="A thing to tell it apart from: a frame of it, or its tuned object; repeatable.",
+    ),
+]
+SpanOption = Annotated[
+    float | None,
+    typer.Option(
+        "--span", min=1, max=100_000, metavar="PX", help="Object's long side; default: measured."
+    ),
+]
+CentersOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--center",
+        metavar="X,Y",
+        help="Object's centre in px, once or for every frame; default: the frames' centres.",
+    ),
+]
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at.")]
 BundleOption = Annotated[
     Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
@@ -262,6 +291,19 @@ def numbers(text: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         return (0,)
+
+
+def parsed_centers(texts: list[str] | None, frames: int) -> list[tuple[float, float] | None]:
+    """A point for each of so many frames: one that all share, or one for each."""
+    points = [parsed_center(text) for text in texts or ()]
+    if len(points) in (0, 1):
+        return (points or [None]) * frames
+    if len(points) != frames:
+        raise typer.BadParameter(
+            f"{len(points)} points for {frames} frames: expected one, or one for every frame",
+            param_hint="'--center'",
+        )
+    return points
 
 
 def parsed_center(text: str | None) -> tuple[float, float] | None:

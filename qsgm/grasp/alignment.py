@@ -36,6 +36,8 @@ class Aligner:
     solid: Floats  # (64, 64), 0 to 1
     slopes: Floats  # (D, 4) by right, down, turn and log of the scale
     normal: NDArray[np.float64]  # (4, 4)
+    variance: float  # of the patch, all channels together
+    middle_px: tuple[float, float]  # of the mask (x, y) [px of the frame] from the patch's middle
 
     @staticmethod
     def of(template: Template) -> "Aligner":
@@ -51,7 +53,12 @@ class Aligner:
         weight = np.repeat(solid.ravel() / total, 3)
         prior = np.diag(NOISE_VARIANCE / (total * _EXPECTED_ERROR**2))
         normal = ((flat.T * weight) @ flat).astype(np.float64) + prior
-        return Aligner(_flattened(image, solid), weight, solid, flat, normal)
+        across, below = (
+            (1 << FINE) * float((solid * along).sum()) / total for along in (x[..., 0], y[..., 0])
+        )
+        taught = _flattened(image, solid)
+        variance = float((weight * taught * taught).sum())
+        return Aligner(taught, weight, solid, flat, normal, variance, (across, below))
 
     def aligned(self, scene: Pyramid, fit: Fit) -> Fit:
         """The best of the fits on the way to a more exact one, the given one among them."""
@@ -69,12 +76,10 @@ class Aligner:
     def _look(self, scene: Pyramid, fit: Fit) -> tuple[float, NDArray[np.float64]]:
         """Correlation of a fit, and by how much (4,) the patch seems to be off from it."""
         seen = _flattened(as_taught(scene, fit), self.solid)
-        product, own, taught = (
-            float((self.weight * one * other).sum())
-            for one, other in ((seen, self.taught), (seen, seen), (self.taught, self.taught))
-        )
-        score = product / sqrt((own + NOISE_VARIANCE) * (taught + NOISE_VARIANCE))
-        gain = product / max(taught, 1e-6)
+        weighed = self.weight * seen
+        product, own = float(weighed @ self.taught), float(weighed @ seen)
+        score = product / sqrt((own + NOISE_VARIANCE) * (self.variance + NOISE_VARIANCE))
+        gain = product / max(self.variance, 1e-6)
         if gain < _LEAST_GAIN:
             return score, np.zeros(4)
         left = self.weight * (seen / gain - self.taught)

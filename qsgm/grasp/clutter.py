@@ -31,6 +31,8 @@ EDGE_SHARE = 0.12
 # Of the positives. A thing is that far from the object: partly over it, touching, or apart.
 BESIDE_SHARE = 0.3
 BESIDE_PX = (42.0, 84.0)
+# Of the things, where the user named some: one among all the drawn ones would hardly be seen.
+NAMED_SHARE = 0.5
 DIM_SHARE = 0.4
 DIMMEST = 0.45
 
@@ -58,19 +60,24 @@ class ClutterPlan:
         return ClutterPlan(self.addition[rows], self.things[rows], self.edges[rows])
 
 
-def plan_clutter(plan: CropPlan, sprites: int, rng: np.random.Generator) -> ClutterPlan:
+def plan_clutter(
+    plan: CropPlan, sprites: int, rng: np.random.Generator, named: int = 0
+) -> ClutterPlan:
     """Draw what is put on planned crops.
 
     Args:
         plan: of the crops; its `quality` says which ones are negatives.
         sprites: how many things there are to choose from.
         rng: the only source of randomness.
+        named: how many of them, the last ones, the user named.
     """
     count = len(plan)
     negative, draw = plan.quality == 0, rng.random(count)
     thing = np.where(negative, draw < THING_SHARE, draw < BESIDE_SHARE)
     edge = negative & ~thing & (draw < THING_SHARE + EDGE_SHARE)
     pastes = plan_pastes(rng, count, sprites)
+    if 0 < named < sprites:
+        pastes = replace(pastes, sprite=_often_named(rng, count, sprites, named))
     beside = HALF_CROP_PX + _ring(rng, count)
     centers = np.where(negative[:, None], pastes.center_px, beside).astype(np.float32)
     return ClutterPlan(
@@ -78,6 +85,15 @@ def plan_clutter(plan: CropPlan, sprites: int, rng: np.random.Generator) -> Clut
         things=replace(pastes, center_px=centers),
         edges=plan_edges(rng, count),
     )
+
+
+def _often_named(
+    rng: np.random.Generator, count: int, sprites: int, named: int
+) -> NDArray[np.int32]:
+    """Sprites (N,), a share of them among the last `named` ones."""
+    drawn = rng.integers(0, sprites - named, count)
+    last = rng.integers(sprites - named, sprites, count)
+    return np.where(rng.random(count) < NAMED_SHARE, last, drawn).astype(np.int32)
 
 
 def dimmed(plan: CropPlan, rng: np.random.Generator) -> CropPlan:

@@ -87,10 +87,12 @@ class Template:
 
     def trials(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
         """The patch in every pose (turn [rad], scale), side by side."""
-        if level != COARSE:
-            return _trials_of(self.layer(level), level, poses)
-        if not self._coarse:  # always the same poses
-            self._coarse.append(_trials_of(self.layer(level), level, poses))
+        return _trials_of(self.layer(level), level, poses)
+
+    def coarse_trials(self) -> Trials:
+        """The patch in all coarse poses."""
+        if not self._coarse:
+            self._coarse.append(self.trials(COARSE, _COARSE_POSES))
         return self._coarse[0]
 
     def layer(self, level: int) -> Floats:
@@ -116,7 +118,7 @@ def coarse_fits(
     Returns:
         Up to three for each point, best first, their turns at least 25 degrees apart.
     """
-    trials = template.trials(COARSE, _COARSE_POSES)
+    trials = template.coarse_trials()
     around = [windows_around(scene, COARSE, center, _COARSE_REACH) for center in centers_px]
     scores, _, _ = correlate(np.concatenate([windows for windows, _ in around]), trials)
     of_each = scores.reshape(len(around), -1, len(_COARSE_POSES))

@@ -1,17 +1,18 @@
 """Look closer at a heatmap's candidates and judge each: the second opinion of the patch.
 
 The network proposes places. The demonstration's patch is laid over each, coarse to fine: cheap
-looks for all, closer ones for the few that fit best.
+looks for all, closer ones for the few that fit best. Of these the two ways round are compared.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.angles import AngleEncoding, decode_angle
 from qsgm.crops import HALF_CROP_PX
+from qsgm.grasp.alignment import Aligner
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.correlation import (
     Fit,
@@ -23,7 +24,7 @@ from qsgm.grasp.correlation import (
     refine_fit,
 )
 from qsgm.grasp.evidence import Reference, evidence, reference_of
-from qsgm.grasp.patch import Patch
+from qsgm.grasp.patch import PATCH_PX, Patch
 
 CELL_PX = 16
 # Cells of the heatmap that the patch is laid over, and how many of these it is laid over finely.
@@ -34,6 +35,10 @@ _QUALITY_WEIGHT = 0.03
 _TURNS = 2
 # Closer than that, two candidates are the same.
 _SAME_PX = 24.0
+# Turns that differ from a half turn by less are the opposite way round.
+_OPPOSITE_RAD = np.deg2rad(30)
+# With such a lead at a quarter of the resolution the other way round need not be looked at closer.
+_CLEAR_LEAD = 0.25
 
 
 @dataclass(frozen=True)
@@ -42,11 +47,17 @@ class Appearance:
 
     template: Template
     reference: Reference
+    aligner: Aligner
 
     @staticmethod
     def of(patch: Patch) -> "Appearance":
         template = Template(patch)
-        return Appearance(template, reference_of(template))
+        return Appearance(template, reference_of(template), Aligner.of(template))
+
+    def center_of(self, fit: Fit) -> tuple[float, float]:
+        """Where the object's centre (x, y) is in the frame that a fit lies over."""
+        x, y = (value - (PATCH_PX - 1) / 2 for value in self.template.patch.center_px)
+        return _laid(fit, x, y)
 
 
 @dataclass(frozen=True)
@@ -55,11 +66,16 @@ class Candidate:
 
     fit: Fit
     evidence: NDArray[np.float32]  # (F,)
+    center_px: tuple[float, float]  # of the object, by the fit
+    cell_px: tuple[float, float]  # of the window by which the network proposed it
+    lead: float  # of the fit's correlation over that of the opposite way round
+    quality: float  # of the network, in [0, 1]
 
 
 @dataclass(frozen=True)
 class _Start:
     fits: tuple[Fit, ...]  # best first, at different turns
+    cell: tuple[int, int]
     quality: float
     angle_rad: float
 
@@ -88,16 +104,15 @@ def judge(
         count: how many to judge at most.
     """
     scene = pyramid_of(frame)
-    cells = candidate_cells(heatmap[0], PROPOSED)
-    centers = [(HALF_CROP_PX + CELL_PX * col, HALF_CROP_PX + CELL_PX * row) for row, col in cells]
-    fits = coarse_fits(appearance.template, scene, centers)
+    cells = candidate_cells(heatmap[0], max(PROPOSED, 2 * count))
+    fits = coarse_fits(appearance.template, scene, [cell_center(cell) for cell in cells])
     angles = [
         float(decode_angle(heatmap[1, row, col], heatmap[2, row, col], encoding)) - offset_rad
         for row, col in cells
     ]
     starts = [
-        _Start(tuple(some), float(heatmap[0, row, col]), angle)
-        for some, (row, col), angle in zip(fits, cells, angles, strict=True)
+        _Start(tuple(some), cell, float(heatmap[0][cell]), angle)
+        for some, cell, angle in zip(fits, cells, angles, strict=True)
     ]
     few = _apart(sorted(starts, key=lambda start: -start.promise), 2 * count)
     closer = [_closer(appearance.template, scene, start) for start in few]
@@ -105,17 +120,74 @@ def judge(
     return [_candidate(appearance, scene, start) for start in best]
 
 
+def best_fit(
+    appearance: Appearance, frame: NDArray[np.uint8], near_px: tuple[float, float]
+) -> tuple[Fit, float]:
+    """How the patch lies best over a frame (H, W, 3) within 24 px of a point (x, y).
+
+    Returns:
+        The fit, and its lead over that of the opposite way round.
+    """
+    scene = pyramid_of(frame)
+    start = _Start(tuple(coarse_fits(appearance.template, scene, [near_px])[0]), (0, 0), 0.5, 0.0)
+    return _better_way_round(appearance, scene, _closer(appearance.template, scene, start))
+
+
+def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
+    """Centre (x, y) [px] of the window that a cell (row, column) of a heatmap looks at."""
+    row, col = cell
+    return float(HALF_CROP_PX + CELL_PX * col), float(HALF_CROP_PX + CELL_PX * row)
+
+
 def _closer(template: Template, scene: Pyramid, start: _Start) -> _Start:
     fits = [middle_fit(template, scene, fit) for fit in start.fits[:_TURNS]]
-    fits.sort(key=lambda fit: -fit.score)
-    return _Start(tuple(fits), start.quality, start.angle_rad)
+    return replace(start, fits=tuple(sorted(fits, key=lambda fit: -fit.score)))
 
 
 def _candidate(appearance: Appearance, scene: Pyramid, start: _Start) -> Candidate:
-    fit = refine_fit(appearance.template, scene, start.fits[0])
-    lead = start.fits[0].score - (start.fits[1].score if len(start.fits) > 1 else 0.0)
-    facts = evidence(appearance.reference, scene, fit, start.quality, start.angle_rad, lead)
-    return Candidate(fit, facts)
+    fit, lead = _better_way_round(appearance, scene, start)
+    others = [other.score for other in start.fits[1:]]
+    ahead = start.fits[0].score - max(others, default=0.0)
+    facts = evidence(appearance.reference, scene, fit, start.quality, start.angle_rad, ahead)
+    center = appearance.center_of(fit)
+    return Candidate(fit, facts, center, cell_center(start.cell), lead, start.quality)
+
+
+def _better_way_round(appearance: Appearance, scene: Pyramid, start: _Start) -> tuple[Fit, float]:
+    """The better of the fit and its opposite, laid exactly, and its lead over the other."""
+    first = start.fits[0]
+    found = [other for other in start.fits[1:] if _is_opposite(first, other)]
+    other = found[0] if found else _opposite(appearance, scene, first)
+    fit = _exact(appearance, scene, first)
+    if first.score - other.score > _CLEAR_LEAD:
+        return fit, first.score - other.score
+    opposite = _exact(appearance, scene, other)
+    better = max(fit, opposite, key=lambda one: one.score)
+    return better, abs(fit.score - opposite.score)
+
+
+def _exact(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
+    fine = refine_fit(appearance.template, scene, fit)
+    return appearance.aligner.aligned(scene, fine)
+
+
+def _is_opposite(one: Fit, other: Fit) -> bool:
+    return bool(np.cos(one.turn_rad - other.turn_rad) < -np.cos(_OPPOSITE_RAD))
+
+
+def _opposite(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
+    """The fit turned by half a turn about the middle of the object's pixels."""
+    x, y = appearance.aligner.middle_px
+    middle = _laid(fit, 2 * x, 2 * y)
+    turned = replace(fit, turn_rad=fit.turn_rad + np.pi, center_px=middle)
+    return middle_fit(appearance.template, scene, turned)
+
+
+def _laid(fit: Fit, x: float, y: float) -> tuple[float, float]:
+    """Where a point (x, y) [px] from the patch's middle lies in the frame."""
+    cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
+    center_x, center_y = fit.center_px
+    return float(center_x + cos * x + sin * y), float(center_y - sin * x + cos * y)
 
 
 def _apart(starts: Sequence[_Start], count: int) -> list[_Start]:

@@ -37,11 +37,11 @@ class CropSource:
         return len(self.plan)
 
     @property
-    def plain(self) -> NDArray[np.bool_]:
-        """Which crops show the frame as it is, with nothing put on them: (N,)."""
+    def addition(self) -> NDArray[np.uint8]:
+        """What is put on each crop (N,): of :class:`qsgm.grasp.clutter.Addition`."""
         if self.clutter is None:
-            return np.ones(len(self), dtype=bool)
-        return np.asarray(self.clutter.addition == Addition.NOTHING)
+            return np.full(len(self), Addition.NOTHING, np.uint8)
+        return self.clutter.addition
 
     def cut(self, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Cut the crops `rows`: (B, 128, 128, 3) BGR."""
@@ -81,7 +81,7 @@ def crop_source(
     clutter = None
     if things is not None:
         plans = [dimmed(plan, rng) for plan in plans]
-        clutter = joined([plan_clutter(plan, len(things), rng) for plan in plans])
+        clutter = joined([plan_clutter(plan, len(things), rng, things.named) for plan in plans])
     whole = CropPlan(
         *(
             np.concatenate([getattr(plan, name) for plan in plans])

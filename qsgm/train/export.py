@@ -33,15 +33,18 @@ from qsgm.bundle import (
     trunk_file,
 )
 from qsgm.crops import cut_crops, label_crops, plan_crops
+from qsgm.distractors import FILE as DISTRACTORS
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.folded import FoldedSgm
+from qsgm.grasp.decision import Decision
 from qsgm.quantize import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.calibrate import AUTO, calibrate
 from qsgm.train.calibration_runs import EPOCHS, Trainee, prepare
 from qsgm.train.calibration_set import CalibrationSet, Demonstration, Watch
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.curvature import FLAT
+from qsgm.train.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
 from qsgm.train.fold import FoldedNet, net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.graphs.inspection import refuse_float_products
@@ -120,6 +123,7 @@ def fold_and_quantize(
     for name, model in graphs.items():
         refuse_float_products(name, model)
     files, sgms = bundle_files(graphs, int8_sgms, trainee.sgms)
+    files[DISTRACTORS] = distractor_file(SHEET_SEED)
     layers = {
         k: LayerReport(fidelity[k], calibration.ranges[k], sgm, int8_sgms[k])
         for k, sgm in trainee.sgms.items()
@@ -312,6 +316,7 @@ def describe(
 ) -> dict[str, Any]:
     """The manifest that :mod:`qsgm.bundle` reads."""
     loss = trainee.checkpoint.loss
+    decision: Decision | None = getattr(trainee.checkpoint, "decision", None)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -325,6 +330,7 @@ def describe(
         },
         "initializers": places(trainee, files[NETWORK]),
         "recipes": recipes(trainee.checkpoint, blocks),
+        **({} if decision is None else {"decision": decision.to_json()}),
     }
 
 

@@ -228,6 +228,7 @@ is in them. Batchnorm is folded into the convolutions (largest change of any out
 | `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step; B: layers in blocks |
 | `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
 | `probe_N.onnx` | int8, float and true gradients of a batch, and the updates they lead to |
+| `distractors.png` | drawn things that are put on crops, to tell the object apart from |
 
 ## Made from
 

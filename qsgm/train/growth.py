@@ -20,7 +20,8 @@ from qsgm.bench.growth import CROPS, FEATURES, GrowthReport, Series
 from qsgm.bench.step_jobs import median_seconds, start_of
 from qsgm.bundle import Bundle, step_file
 from qsgm.crops import CROPS as USUAL_CROPS
-from qsgm.crops import TRAIN_CROPS, label_crops, plan_crops
+from qsgm.crops import TRAIN_CROPS, label_crops
+from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.preparing import Array, Watch, ignore, running_graphs, see
 from qsgm.settings import Settings
 from qsgm.train.growth_jobs import (
@@ -133,11 +134,13 @@ def stage_seconds(
 ) -> dict[str, float]:
     """Of one job on so many crops: cutting them, their features, and tuning by each method."""
     height, width = image.shape[:2]
-    plan = plan_crops((height, width), (width / 2, height / 2), np.random.default_rng(0), count)
+    demonstration = Demonstration(image, (width / 2, height / 2))
+    things = bundle.distractors()
+    crops = crop_source([demonstration], things, np.random.default_rng(0), count)
     seconds = {CROPS: 0.0, FEATURES: 0.0}
     settings = Settings(layers=TUNED, threads=threads)
-    features = see(image, plan, bundle, settings, seconds, ignore)
-    labels, trained = label_crops(plan), count * TRAIN_CROPS // USUAL_CROPS
+    features = see(crops, bundle, settings, seconds, ignore)
+    labels, trained = label_crops(crops.plan), count * TRAIN_CROPS // USUAL_CROPS
     for method in METHODS:
         loop = method_loop(method, features, labels, bundle, threads)
         began = time.perf_counter()

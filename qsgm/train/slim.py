@@ -27,6 +27,7 @@ from qsgm.bundle import (
     step_file,
     trunk_file,
 )
+from qsgm.distractors import FILE as DISTRACTORS
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
@@ -87,7 +88,7 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
     for graph in graphs.values():
         shorten(graph)
     files = {name: graph.SerializeToString() for name, graph in graphs.items()}
-    files |= {NETWORK: network, WEIGHTS: shared.data}
+    files |= {NETWORK: network, WEIGHTS: shared.data, **kept_things(bundle)}
     manifest = kept_manifest(bundle, blocks) | {
         "sgms": sgms,
         "files": {name: kept_entry(bundle, name, data) for name, data in files.items()},
@@ -110,6 +111,12 @@ def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
     if probe_file(tuned) in bundle.manifest["files"]:
         names.append(probe_file(tuned))
     return list(dict.fromkeys(names))
+
+
+def kept_things(bundle: Bundle) -> dict[str, bytes]:
+    """The sheet of things to tell an object apart from, if the bundle has one."""
+    there = DISTRACTORS in bundle.manifest["files"]
+    return {DISTRACTORS: (bundle.folder / DISTRACTORS).read_bytes()} if there else {}
 
 
 def kept_sgms(bundle: Bundle, blocks: Blocks, shared: SharedConstants) -> dict[str, Any]:

@@ -23,7 +23,9 @@ from torch.nn import functional as F
 
 from qsgm.angles import angle_error, decode_angle, mean_direction
 from qsgm.bundle import NETWORK, Bundle, load_bundle
-from qsgm.crops import TRAIN_CROPS, CropPlan, cut_crops, label_crops, plan_crops
+from qsgm.crops import TRAIN_CROPS, CropPlan, label_crops
+from qsgm.grasp.shown import shown
+from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.images import read_demonstration
 from qsgm.train.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss, normalize
 from qsgm.tuning import BATCH, batches, rate_factor
@@ -43,9 +45,12 @@ def run(
     seconds = {"crops": 0.0, "features": 0.0}
     frame = read_demonstration(frame_path)
     height, width = frame.shape[:2]
-    plan = plan_crops((height, width), (width / 2, height / 2), np.random.default_rng(seed))
+    seen = shown([Demonstration(frame, (width / 2, height / 2))])
+    rng = np.random.default_rng(seed)
+    crops = crop_source(seen.demonstrations, bundle.distractors(), rng)
+    plan = crops.plan
     convolutions = load_layers(bundle)
-    features = see(convolutions[:-layers], frame, plan, seconds)
+    features = see(convolutions[:-layers], crops, seconds)
     tuned, loss = convolutions[-layers:], Loss(bundle.encoding, bundle.label_smoothing)
     turned = angles(answers(tuned, features), loss)
     positive = np.flatnonzero(plan.quality[:TRAIN_CROPS] > 0)
@@ -83,14 +88,12 @@ def load_layers(bundle: Bundle) -> list[nn.Conv2d]:
 
 
 @torch.inference_mode()
-def see(
-    frozen: list[nn.Conv2d], frame: NDArray[np.uint8], plan: CropPlan, seconds: dict[str, float]
-) -> Tensor:
+def see(frozen: list[nn.Conv2d], source: CropSource, seconds: dict[str, float]) -> Tensor:
     """Features (N, C, H, W) of the planned crops; adds to the seconds of both stages."""
     features = []
-    for first in range(0, len(plan), SLICE):
+    for rows in np.split(np.arange(len(source)), range(SLICE, len(source), SLICE)):
         start = time.perf_counter()
-        crops = cut_crops(frame, plan[first : first + SLICE])
+        crops = source.cut(rows)
         cut = time.perf_counter()
         x = normalize(torch.from_numpy(crops))
         features.append(forward(frozen, 1, x))

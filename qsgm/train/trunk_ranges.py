@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F
 
-from qsgm.crops import cut_crops, plan_crops
+from qsgm.grasp import source
 from qsgm.train.calibration_set import CalibrationSet, Demonstration, Watch
 from qsgm.train.fold import FoldedNet
 from qsgm.train.graspnet import normalize
 from qsgm.train.quantize_trunk import LayerRange
+from qsgm.train.tasks import shipped_things
 
 CROPS = 200  # of each frame
 
@@ -46,9 +47,8 @@ def observe_trunk(
 
 def calibration_crops(demonstration: Demonstration, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Crops (N, 128, 128, 3) of one frame, as the device cuts them."""
-    height, width = demonstration.image.shape[:2]
-    plan = plan_crops((height, width), demonstration.center_px, rng, CROPS)
-    return cut_crops(demonstration.image, plan)
+    shown = source.Demonstration(demonstration.image, demonstration.center_px)
+    return source.crop_source([shown], shipped_things(), rng, CROPS).cut(np.arange(CROPS))
 
 
 def observe_crops(net: FoldedNet, crops: NDArray[np.uint8]) -> Iterator[tuple[int, LayerRange]]:

@@ -1,0 +1,139 @@
+"""How large the object is in its demonstration, and what the frame is scaled by because of that.
+
+The network looks at windows of 128 px, in which an object should span 60 to 110. A photograph does
+not say how large its object is: so it is halved again and again, and cut out of every halving. A
+cut that is right gives the same span in two of them; one that is a part of the object, or table
+with it, hardly ever does.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise, zip_longest
+from math import sqrt
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+from qsgm.grasp.patch import LARGEST_RADIUS_PX, PATCH_PX, cut_patch, mirrored_square
+
+Frame = NDArray[np.uint8]
+Point = tuple[float, float]
+
+# A span between these is left as it is: the frame is not scaled at all.
+LEAST_SPAN_PX, LARGEST_SPAN_PX = 45.0, 124.0
+IDEAL_SPAN_PX = 90.0
+# Where a frame would get too small, the object may stay as large as that: a cut is often too large.
+MOST_SPAN_PX = 144.0
+MOST_ENLARGED = 2.0
+MIN_SIDE_PX = 256
+# Spans in two halvings that differ by less than this factor are of the same thing.
+_SAME_SPAN = 1.25
+# A cut that reaches the radius where GrabCut is told that everything is table was cut off there.
+_TOUCHING_PX = 2.0
+# A halving with less than this on each side shows hardly more than the patch's mirrored border.
+_LEAST_HALVED_PX = 3 * PATCH_PX // 4
+# An object of this share of the frame's shorter side is hardly a part of a larger one.
+_LARGE_SHARE = 0.12
+# Of a halving's pixels: a cut that spans less is mostly noise.
+_LEAST_CUT_PX = 18.0
+
+
+def measured_span(frame: Frame, center_px: Point) -> float | None:
+    """Long side [px] of the object at `center_px` (x, y) in a frame (H, W, 3) BGR.
+
+    None where no two sizes of the frame agree on it.
+    """
+    spans = _spans(frame, center_px)
+    agreed = _agreed(spans)
+    if agreed is None:
+        # Between the halvings, where an object may be that is too large in one, too small in two.
+        between = scaled_frame(frame, sqrt(0.5))
+        middle = moved_point(center_px, frame.shape[:2], between.shape[:2])
+        others = [span and span * sqrt(2) for span in _spans(between, middle)]
+        mixed = [span for both in zip_longest(spans, others) for span in both]
+        agreed = _agreed(mixed) or max((span for span in mixed if span), default=None)
+    if agreed is not None and agreed < LEAST_SPAN_PX:
+        return _span_of_small(frame, center_px, agreed)
+    return agreed
+
+
+def scale_for(span_px: float | None, frame_hw: tuple[int, int]) -> float:
+    """What a frame is scaled by so that its object fits the network's windows.
+
+    Args:
+        span_px: the object's long side; None, or one that fits: 1.
+        frame_hw: height and width [px].
+
+    Raises:
+        QsgmError: the object fills its frame, so that there is nothing beside it to tell it from.
+    """
+    if span_px is None or LEAST_SPAN_PX <= span_px <= LARGEST_SPAN_PX:
+        return 1.0
+    least = MIN_SIDE_PX / min(frame_hw)
+    wanted = min(IDEAL_SPAN_PX / span_px, MOST_ENLARGED)
+    if wanted >= least:
+        return wanted
+    if least * span_px > MOST_SPAN_PX:
+        height, width = frame_hw
+        raise QsgmError(
+            f"the object spans about {span_px:.0f} px of the {width}x{height} frame, which leaves "
+            "no room beside it: expected less than half of the shorter side; step back, or say how "
+            "large it is with --span"
+        )
+    return least
+
+
+def scaled_frame(frame: Frame, scale: float) -> Frame:
+    """A frame (H, W, 3) made smaller by area or larger by bilinear interpolation."""
+    if scale == 1.0:
+        return frame
+    height, width = (max(round(side * scale), 1) for side in frame.shape[:2])
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(frame, (width, height), interpolation=how), dtype=np.uint8)
+
+
+def moved_point(point_px: Point, source_hw: tuple[int, int], target_hw: tuple[int, int]) -> Point:
+    """Where a point (x, y) of a frame lies in the same frame at another size."""
+    x, y = (
+        (value + 0.5) * target / source - 0.5
+        for value, source, target in zip(point_px, source_hw[::-1], target_hw[::-1], strict=True)
+    )
+    return x, y
+
+
+def _spans(frame: Frame, center_px: Point) -> list[float | None]:
+    """The span [px of the frame] in each halving, from the frame itself on; None: no good cut."""
+    spans: list[float | None] = []
+    halved, times = frame, 1
+    while min(halved.shape[:2]) >= _LEAST_HALVED_PX:
+        span = _span(halved, moved_point(center_px, frame.shape[:2], halved.shape[:2]))
+        spans.append(None if span is None else span * times)
+        if (_agreed(spans) or 0.0) >= _LARGE_SHARE * min(frame.shape[:2]):
+            break
+        halved, times = scaled_frame(halved, 0.5), 2 * times
+    return spans
+
+
+def _span_of_small(frame: Frame, center_px: Point, span_px: float) -> float | None:
+    """A span that is small, if it is the same in the frame enlarged: else it is that of a part."""
+    left, top = (round(value) - PATCH_PX // 2 for value in center_px)
+    doubled = scaled_frame(mirrored_square(frame, left, top, PATCH_PX), 2.0)
+    middle = (PATCH_PX - 0.5, PATCH_PX - 0.5)
+    large = _span(doubled, middle)
+    return _agreed([None if large is None else large / 2, span_px])
+
+
+def _span(frame: Frame, center_px: Point) -> float | None:
+    patch = cut_patch(frame, center_px)
+    if not patch.cut_out or patch.radius_px > LARGEST_RADIUS_PX - _TOUCHING_PX:
+        return None
+    long_px, _ = patch.span_px
+    return long_px if long_px >= _LEAST_CUT_PX else None
+
+
+def _agreed(spans: Sequence[float | None]) -> float | None:
+    """Of spans in one halving after the other: the largest on which two neighbours agree."""
+    pairs = [(a, b) for a, b in pairwise(spans) if a and b]
+    same = [a for a, b in pairs if max(a, b) <= _SAME_SPAN * min(a, b)]
+    return max(same, default=None)
