@@ -18,7 +18,8 @@ from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, WINDOW_PX, Fit, Pyramid
 Floats = NDArray[np.float32]
 
 SIDE = WINDOW_PX >> FINE
-_LOOKS = 6
+_STEPS = 4
+_SLACK = 0.02
 # What a fit is off by before: right and down [px of the level], turn [rad], log of the scale.
 _EXPECTED_ERROR = np.array([1.0, 1.0, 0.05, 0.05])
 # Further from where it began, a fit has slid onto something else.
@@ -61,17 +62,20 @@ class Aligner:
         return Aligner(taught, weight, solid, flat, normal, variance, (across, below))
 
     def aligned(self, scene: Pyramid, fit: Fit) -> Fit:
-        """The best of the fits on the way to a more exact one, the given one among them."""
-        best, here = replace(fit, score=-np.inf), fit
-        for _ in range(_LOOKS):
-            score, step = self._look(scene, here)
-            if score <= best.score:
-                break
-            best = replace(here, score=score)
+        """The fit that is left once the patch seems to be off by nothing.
+
+        The given one where that leads away from it, or to a worse one.
+        """
+        here = fit
+        first, step = self._look(scene, here)
+        score = first
+        for _ in range(_STEPS):
             here = _stepped(here, step)
             if (_distances(here, fit) > _FURTHEST).any():
-                break
-        return best
+                return replace(fit, score=first)
+            score, step = self._look(scene, here)
+        # Least squares and the highest correlation are not quite the same.
+        return replace(here, score=score) if score >= first - _SLACK else replace(fit, score=first)
 
     def _look(self, scene: Pyramid, fit: Fit) -> tuple[float, NDArray[np.float64]]:
         """Correlation of a fit, and by how much (4,) the patch seems to be off from it."""

@@ -1,0 +1,135 @@
+"""Correlation and alignment against plain formulas and objects laid between pixels."""
+
+import math
+
+import numpy as np
+import pytest
+from toys import lay, table, toy
+
+from qsgm.grasp.alignment import as_taught
+from qsgm.grasp.correlation import (
+    COARSE,
+    FINE,
+    NOISE_VARIANCE,
+    Fit,
+    Template,
+    coarse_fits,
+    correlate,
+    pyramid_of,
+    windows_around,
+)
+from qsgm.grasp.judge import Appearance, best_fit
+from qsgm.grasp.patch import cut_patch
+
+CENTER = (320.0, 240.0)
+DEMONSTRATION = lay(toy(), table(), CENTER)
+APPEARANCE = Appearance.of(cut_patch(DEMONSTRATION, CENTER))
+
+
+def turn_error(fit: Fit, turn_deg: float) -> float:
+    return abs((math.degrees(fit.turn_rad) - turn_deg + 180) % 360 - 180)
+
+
+def test_every_halving_is_the_mean_of_four_pixels_whatever_the_size() -> None:
+    frame = np.random.default_rng(0).integers(0, 255, (101, 131, 3), dtype=np.uint8)
+    levels = pyramid_of(frame).levels
+    first = frame[:100, :130].astype(float).reshape(50, 2, 65, 2, 3).mean(axis=(1, 3))
+    second = levels[1][:, :64].astype(float).reshape(25, 2, 32, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(levels[1], first, atol=1e-3)
+    np.testing.assert_allclose(levels[2], second, atol=1e-3)
+
+
+def test_windows_are_the_frames_pixels_around_their_centres() -> None:
+    scene = pyramid_of(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8))
+    windows, places = windows_around(scene, FINE, (203.0, 151.0), 2)
+    assert windows.shape == (25, 3, 64 * 64)
+    for window, (x, y) in zip(windows, places, strict=True):
+        left, top = round((x + 0.5) / 2 - 32), round((y + 0.5) / 2 - 32)
+        expected = scene.levels[FINE][top : top + 64, left : left + 64].transpose(2, 0, 1)
+        np.testing.assert_array_equal(window, expected.reshape(3, -1))
+    assert np.abs(places[12] - (203, 151)).max() <= 1
+    assert np.ptp(places, axis=0).tolist() == [8, 8]
+
+
+def test_correlation_is_that_of_the_masked_pixels_each_channel_around_its_mean() -> None:
+    rng = np.random.default_rng(1)
+    windows = rng.uniform(0, 255, (3, 3, 256)).astype(np.float32)
+    trials = APPEARANCE.template.trials(COARSE, [(0.3, 1.0), (-2.0, 0.85)])
+    scores, _, _ = correlate(windows, trials)
+    for a, window in enumerate(windows.astype(float)):
+        for k, mask in enumerate(trials.mask.astype(float)):
+            assert mask.sum() == pytest.approx(1, abs=1e-5)
+            centred = window - (window * mask).sum(axis=1, keepdims=True)
+            patch = trials.centred[k].reshape(3, -1) / np.maximum(mask, 1e-12)
+            patch[:, mask < 1e-6] = 0
+            both, own, taught = (
+                float((one * other * mask).sum())
+                for one, other in ((centred, patch), (centred, centred), (patch, patch))
+            )
+            expected = both / math.sqrt((own + NOISE_VARIANCE) * (taught + NOISE_VARIANCE))
+            assert scores[a, k] == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_demonstration_itself_is_found_where_and_as_it_lies() -> None:
+    fit, lead = best_fit(APPEARANCE, DEMONSTRATION, (327.0, 233.0))
+    assert math.dist(APPEARANCE.center_of(fit), CENTER) < 0.05
+    assert turn_error(fit, 0) < 0.05
+    assert fit.scale == pytest.approx(1, abs=0.002)
+    assert fit.score > 0.98
+    assert lead > 0.2
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_an_object_is_laid_on_between_pixels_turns_and_scales(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    center = (320 + rng.uniform(-150, 150), 240 + rng.uniform(-100, 100))
+    turn, scale = rng.uniform(-180, 180), rng.uniform(0.85, 1.18)
+    scene = lay(toy(), table(seed + 1), center, turn, scale, light=rng.uniform(0.6, 1.1))
+    near = (center[0] + rng.uniform(-11, 11), center[1] + rng.uniform(-11, 11))
+    fit, _ = best_fit(APPEARANCE, scene, near)
+    assert math.dist(APPEARANCE.center_of(fit), center) < 0.3
+    assert turn_error(fit, turn) < 0.3
+    assert fit.scale == pytest.approx(scale, rel=0.01)
+
+
+@pytest.mark.parametrize("center", [(320.5, 239.5), (320.3, 240.4)])
+def test_a_demonstration_between_pixels_keeps_its_centre(center: tuple[float, float]) -> None:
+    appearance = Appearance.of(cut_patch(lay(toy(), table(), center), center))
+    scene = lay(toy(), table(3), (250.25, 200.75), 180)
+    fit, _ = best_fit(appearance, scene, (250.0, 200.0))
+    assert math.dist(appearance.center_of(fit), (250.25, 200.75)) < 0.2
+
+
+def test_the_same_object_at_the_border_of_a_frame_is_found_as_well() -> None:
+    scene = lay(toy(), table(2), (70.0, 400.0), 77)
+    fit, _ = best_fit(APPEARANCE, scene, (64.0, 400.0))
+    assert math.dist(APPEARANCE.center_of(fit), (70, 400)) < 0.5
+
+
+def test_the_two_ways_round_of_an_object_without_a_front_are_level() -> None:
+    frame = lay(toy(front=False), table(), CENTER)
+    appearance = Appearance.of(cut_patch(frame, CENTER))
+    fit, lead = best_fit(appearance, lay(toy(front=False), table(1), CENTER, 40), CENTER)
+    assert min(turn_error(fit, 40), turn_error(fit, -140)) < 0.5
+    assert lead < 0.02
+
+
+def test_coarse_fits_are_of_different_turns_the_best_first() -> None:
+    scene = pyramid_of(lay(toy(), table(1), CENTER, 123))
+    (fits,) = coarse_fits(Template(APPEARANCE.template.patch), scene, [CENTER])
+    assert [fit.score for fit in fits] == sorted((fit.score for fit in fits), reverse=True)
+    assert turn_error(fits[0], 123) < 8
+    turns = [math.degrees(fit.turn_rad) for fit in fits]
+    assert all(abs((a - b + 180) % 360 - 180) > 25 for i, a in enumerate(turns) for b in turns[:i])
+
+
+def test_a_scene_moved_back_by_its_fit_is_the_demonstration() -> None:
+    center, turn, scale = (290.3, 260.8), 70.0, 1.1
+    scene = pyramid_of(lay(toy(), table(), center, turn, scale))
+    fit = Fit(0, math.radians(turn), scale, center)
+    taught = as_taught(pyramid_of(DEMONSTRATION), Fit(0, 0, 1.0, CENTER))
+    seen = as_taught(scene, fit)
+    mask = APPEARANCE.reference.mask > 0
+    assert np.abs(seen - taught)[mask].mean() < 6
+    wrong = as_taught(scene, Fit(0, math.radians(turn + 20), scale, center))
+    assert np.abs(wrong - taught)[mask].mean() > 15
