@@ -44,9 +44,9 @@ class Decision:
         return np.asarray(1 / (1 + np.exp(-odds)))
 
     def to_json(self) -> dict[str, Any]:
-        """What :meth:`from_json` reads; seven digits keep a float32."""
+        """What :meth:`from_json` reads; nine digits keep a float32."""
         arrays = {
-            name: [float(f"{value:.7g}") for value in np.ravel(getattr(self, name))]
+            name: [float(f"{value:.9g}") for value in np.ravel(getattr(self, name))]
             for name in ("mean", "deviation", "hidden", "hidden_bias", "output")
         }
         return {"evidence": list(NAMES), **arrays, "bias": self.bias, "threshold": self.threshold}

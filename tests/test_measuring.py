@@ -1,0 +1,75 @@
+"""How large an object is, whatever the camera: measured, scaled by, and refused in one line."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from toys import lay, table, toy
+
+from qsgm import QsgmError
+from qsgm.grasp.measuring import measured_span, moved_point, scale_for, scaled_frame
+
+
+def shown(scale: float, frame_hw: tuple[int, int] = (480, 640), turn_deg: float = 25) -> Any:
+    """An object of 90 px times a scale in the middle of a frame, and that middle."""
+    height, width = frame_hw
+    center = (width / 2, height / 2)
+    return lay(toy(), table(1, frame_hw), center, turn_deg, scale), center
+
+
+@pytest.mark.parametrize("scale", [0.35, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0])
+def test_the_long_side_is_measured_from_small_to_large(scale: float) -> None:
+    assert measured_span(*shown(scale)) == pytest.approx(90 * scale, rel=0.1)
+
+
+@pytest.mark.parametrize("enlarged", [2, 3.3, 6.3])
+def test_a_photograph_of_many_pixels_has_its_object_measured(enlarged: float) -> None:
+    frame, (x, y) = shown(1.0)
+    large = cv2.resize(frame, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC)
+    center = moved_point((x, y), frame.shape[:2], large.shape[:2])
+    assert measured_span(large, center) == pytest.approx(90 * enlarged, rel=0.1)
+
+
+def test_nothing_is_measured_where_there_is_no_object() -> None:
+    assert measured_span(table(2), (320.0, 240.0)) is None
+
+
+@pytest.mark.parametrize("span", [None, 45.0, 60.0, 90.0, 115.0, 124.0])
+def test_an_object_that_fits_is_left_as_it_is(span: float | None) -> None:
+    assert scale_for(span, (480, 640)) == 1
+
+
+@pytest.mark.parametrize(
+    ("span", "frame_hw", "scale"),
+    [
+        (180.0, (480, 640), 256 / 480),  # no smaller than 256 px
+        (180.0, (720, 1280), 0.5),
+        (800.0, (3024, 4032), 90 / 800),
+        (40.0, (480, 640), 2.0),
+        (20.0, (480, 640), 2.0),
+        (44.9, (480, 640), 2.0),
+    ],
+)
+def test_others_are_scaled_until_they_do(
+    span: float, frame_hw: tuple[int, int], scale: float
+) -> None:
+    assert scale_for(span, frame_hw) == pytest.approx(scale, abs=0.005)
+
+
+def test_an_object_that_fills_its_frame_is_refused_in_one_line() -> None:
+    with pytest.raises(QsgmError, match=r"spans about 400 px of the 640x480 frame, .* step") as got:
+        scale_for(400, (480, 640))
+    assert "\n" not in str(got.value)
+    assert "--span" in str(got.value)
+
+
+def test_a_point_stays_on_the_same_spot_of_a_scaled_frame() -> None:
+    frame = np.zeros((300, 500, 3), np.uint8)
+    frame[100:104, 200:204] = 255
+    small = scaled_frame(frame, 0.25)
+    assert small.shape == (75, 125, 3)
+    y, x = np.argwhere(small[..., 0] > 250)[0]
+    assert moved_point((201.5, 101.5), (300, 500), (75, 125)) == (x, y)
+    assert moved_point((x, y), (75, 125), (300, 500)) == (201.5, 101.5)
+    assert scaled_frame(frame, 1.0) is frame
