@@ -14,6 +14,8 @@ from qsgm.train import pretrain as module
 from qsgm.train import rates as rates_module
 from qsgm.train.backbone import BackboneConfig
 from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.decision import DecisionConfig
+from qsgm.train.decision_scenes import DecisionScenesConfig
 from qsgm.train.early import EarlyConfig
 from qsgm.train.evaluate import Score
 from qsgm.train.graspnet import Loss
@@ -27,7 +29,7 @@ TINY = PretrainConfig(
     hidden=(8,),
     tasks=2,
     crops_per_task=50,
-    backbone=BackboneConfig(steps=4, frames_per_batch=2, crops_per_frame=8, loader_processes=0),
+    backbone=BackboneConfig(steps=4, episodes_per_batch=2, crops_per_episode=8, loader_processes=0),
     matching=MatchingConfig(epochs=1, record_every=1, fit_steps=4, fit_batch=16),
     maml=MamlConfig(outer_steps=2, tasks_per_step=2, unroll=2, warm_up=1),
     early=EarlyConfig(
@@ -47,6 +49,8 @@ TINY = PretrainConfig(
         early_crops_per_task=10,
         early_epochs=1,
     ),
+    scenes=DecisionScenesConfig(episodes=2, scenes=2, crops=20, support=16, epochs=1),
+    decision=DecisionConfig(hidden=4, steps=5, folds=2),
 )
 
 
@@ -79,6 +83,7 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
         "meta",
         "early",
         "rates",
+        "decision",
     ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
     assert (checkpoint.card["device"], checkpoint.card["resumed"]) == ("cpu", False)

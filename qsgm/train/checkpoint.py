@@ -17,6 +17,7 @@ from qsgm.angles import AngleEncoding
 from qsgm.blocks import LAYERS, parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
+from qsgm.grasp.decision import Decision
 from qsgm.train.curvature import Curvature
 from qsgm.train.graspnet import GraspNet, Loss
 from qsgm.train.sgm import SGM_LAYERS, Sgm
@@ -55,6 +56,7 @@ class Checkpoint:
     rates: dict[str, tuple[float, ...]]  # of SGD, by blocks such as `4,5,6`; first layer first
     card: dict[str, Any]  # how it was made, and its figures; plain JSON
     short_gain: float = 1.0  # what short runs of three layers and more multiply rates with
+    decision: Decision | None = None  # whether a candidate is the object; older files have none
 
     def __post_init__(self) -> None:
         last = [*range(LAYERS - len(self.sgms), LAYERS)]
@@ -92,6 +94,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "rates": {blocks: list(rates) for blocks, rates in checkpoint.rates.items()},
         "card": json.dumps(checkpoint.card),
         "short_gain": checkpoint.short_gain,
+        "decision": None if checkpoint.decision is None else checkpoint.decision.to_json(),
     }
     buffer = BytesIO()
     torch.save(data, buffer)
@@ -115,7 +118,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         loss, rates = _loss(data["loss"]), _rates(data["rates"])
         card = dict(json.loads(data["card"]))
         gain = _number(data["short_gain"])
-        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card, gain)
+        weighed = data.get("decision")
+        decision = None if weighed is None else Decision.from_json(weighed, str(path))
+        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card, gain, decision)
     except _UNFIT as error:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"

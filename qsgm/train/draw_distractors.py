@@ -17,6 +17,7 @@ from qsgm.train.drawing.noise import Colour
 from qsgm.train.drawing.scenes import draw_alone, draw_object
 from qsgm.train.drawing.shapes import OBJECT_KINDS
 
+SHEET_SEED = 0  # of the sheet that ships
 TILES_HW = (4, 6)  # 24 things, every kind among them
 COLOUR_BITS = 5
 OPACITY_BITS = 4

@@ -1,10 +1,11 @@
-"""`qsgm pretrain`: from nothing to `sgm.pt`, in five stages, resumable.
+"""`qsgm pretrain`: from nothing to `sgm.pt`, in six stages, resumable.
 
-1. backbone: GraspNet learns drawn objects by backpropagation.
+1. backbone: GraspNet learns drawn objects, and to tell them apart, by backpropagation.
 2. matching: the SGMs behind layers 4 and 5 regress true gradients.
 3. meta: MAML with these SGMs as the update rule, three layers tuned.
 4. early: the SGMs behind layers 1 to 3 regress true gradients.
 5. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
+6. decision: how the evidence for and against a candidate is weighed, on whole drawn scenes.
 
 What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
 version's same command: output, seed and device.
@@ -27,8 +28,11 @@ import qsgm
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
+from qsgm.grasp.decision import Decision
 from qsgm.train.backbone import BackboneConfig, BackboneTraining, in_memory_format
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
+from qsgm.train.decision import DecisionConfig, fit_decision
+from qsgm.train.decision_scenes import DecisionScenesConfig, judged_scenes
 from qsgm.train.early import EarlyConfig, EarlyMatching
 from qsgm.train.evaluate import Score, UpdateRule
 from qsgm.train.graspnet import LAYERS, GraspNet, Loss
@@ -71,6 +75,8 @@ class PretrainConfig:
     maml: MamlConfig = field(default_factory=MamlConfig)
     early: EarlyConfig = field(default_factory=EarlyConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
+    scenes: DecisionScenesConfig = field(default_factory=DecisionScenesConfig)
+    decision: DecisionConfig = field(default_factory=DecisionConfig)
 
 
 def pretrain(
@@ -105,9 +111,11 @@ def pretrain(
         early = _match_early(partial, net, rule, config, seed, watch)
         rule = replace(rule, sgms={**early, **rule.sgms})
         rates, gain, score = _choose_rates(net, rule, config, seed, watch)
+        rule = replace(rule, rates=rates[str(single_layers(TUNED))])
+        decision = _decide(net, rule, config, seed, watch)
     command = _command(seed, device, config, loss)
     card = _card(command, device, config, score, partial)
-    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card, gain)
+    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card, gain, decision)
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
     partial.remove()
@@ -314,6 +322,21 @@ def _choose_rates(
     rates |= choose_early(rule, folded_start(net, LAYERS), pixels, sizes, after_run)
     singles = {str(single_layers(tuned)): of_layers for tuned, of_layers in rates.items()}
     return singles | block_rates(rates[TUNED]), gain, score
+
+
+def _decide(
+    net: GraspNet, rule: UpdateRule, config: PretrainConfig, seed: int, watch: Watch
+) -> Decision:
+    done = 0
+
+    def after_episode() -> None:
+        nonlocal done
+        done += 1
+        watch("decision", done, config.scenes.episodes, {})
+
+    start = folded_start(net, TUNED)
+    judged = judged_scenes(net, rule, start, config.scenes, seed + 7, after_episode)
+    return fit_decision(judged, config.decision, seed)
 
 
 def _check_device(device: str) -> None:
