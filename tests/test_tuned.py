@@ -1,16 +1,24 @@
 """A tuned object on disk: written whole, read back as it was, refused when it is not."""
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from toys import bump, by_correlation, lay, table, toy
 
 from qsgm import QsgmError, load_object
 from qsgm.bundle import NETWORK, Bundle
-from qsgm.tuned import DESCRIPTION, REPORT, ObjectDescription, save_object
+from qsgm.grasp.decision import Decision
+from qsgm.grasp.patch import cut_patch
+from qsgm.grasp.shown import View
+from qsgm.predict import Detection, Place, locate, refine
+from qsgm.tuned import DESCRIPTION, REPORT, ObjectDescription, TunedObject, save_object
 
+Point = tuple[float, float]
 MUG = ObjectDescription("mug", "double", 0.25)
 
 
@@ -110,3 +118,265 @@ def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Pa
 def test_a_frame_that_does_not_fit_the_network_is_refused(saved: Path) -> None:
     with pytest.raises(QsgmError, match=r"does not fit .*; tune the object again"):
         load_object(saved).heatmap(np.zeros((128, 128, 5), np.uint8))
+
+
+CENTER = (320.0, 240.0)
+DEMONSTRATION = lay(toy(), table(), CENTER)
+
+
+class Told(TunedObject):
+    """A tuned object whose network sees what a test says, in pixels of the scaled frame."""
+
+    def __init__(self, bundle: Bundle, description: ObjectDescription, *seen: Point) -> None:
+        super().__init__(description, bundle.network_with({}), 1)
+        self.seen = [*seen]
+        self.angle_rad = 0.0
+
+    def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return bump(self.seen, frame.shape[:2], self.angle_rad)
+
+
+def described(
+    picture: NDArray[np.float32] | None = None, decision: Decision | None = None, scale: float = 1.0
+) -> ObjectDescription:
+    """A toy as it is kept, by default with a decision by correlation alone."""
+    frame = lay(toy() if picture is None else picture, table(), CENTER)
+    view = View(cut_patch(frame, CENTER), 0.0, whole=True)
+    chosen = by_correlation() if decision is None else decision
+    return ObjectDescription("toy", "double", 0.0, scale, (view,), chosen, {"seed": 4})
+
+
+def turn_error(got: float | None, expected: float, circle: float = 360) -> float:
+    assert got is not None
+    return abs((got - expected + circle / 2) % circle - circle / 2)
+
+
+def test_the_demonstration_is_found_at_its_centre_and_not_turned(bundle: Bundle) -> None:
+    found, _ = Told(bundle, described(), (327.0, 232.0)).locate(DEMONSTRATION)
+    assert found.found
+    assert found.refined_by == "patch"
+    assert math.dist(found.center_px, CENTER) < 0.3
+    assert found.displacement_px == pytest.approx((0, 0), abs=0.3)
+    assert abs(found.angle_deg) < 0.3
+    assert turn_error(found.full_angle_deg, 0) < 0.3
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_moved_and_turned_object_is_found_to_half_a_pixel_and_half_a_degree(
+    bundle: Bundle, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    center = (320 + rng.uniform(-200, 200), 240 + rng.uniform(-130, 130))
+    turn = rng.uniform(-180, 180)
+    scene = lay(toy(), table(seed + 1), center, turn, light=rng.uniform(0.7, 1.1))
+    found, _ = Told(bundle, described(), center, (100.0, 100.0)).locate(scene)
+    assert math.dist(found.center_px, center) < 0.5
+    assert turn_error(found.full_angle_deg, turn) < 0.5
+    assert turn_error(found.angle_deg, turn, 180) < 0.5
+    assert -90 < found.angle_deg <= 90
+    assert found.full_angle_confidence is not None
+    assert found.full_angle_confidence > 0.9
+
+
+def test_another_thing_where_the_network_is_surest_is_not_taken_for_the_object(
+    bundle: Bundle,
+) -> None:
+    other = toy()[..., [1, 0, 2, 3]]
+    other[200:280, 100:380, :3] = 255 - other[200:280, 100:380, :3]
+    both = lay(other, lay(toy(), table(2), (200.0, 180.0), 20), (450.0, 300.0), 70)
+    told = Told(bundle, described(), (450.0, 300.0))
+    told.seen += [(208.0, 170.0)]
+    found, _ = told.locate(both)
+    assert math.dist(found.center_px, (200, 180)) < 0.5
+    alone, _ = told.locate(lay(other, table(2), (450.0, 300.0), 70))
+    assert not alone.found
+    assert alone.quality < 0.5
+    assert alone.candidates[0].quality == alone.quality
+
+
+def test_candidates_are_the_judged_places_best_first_this_one_among_them(bundle: Bundle) -> None:
+    scene = lay(toy(), table(2), (200.0, 180.0), 20)
+    found, _ = Told(bundle, described(), (200.0, 180.0), (450.0, 300.0)).locate(scene)
+    first, *others = found.candidates
+    assert first == Place(found.center_px, found.quality, found.angle_deg, found.full_angle_deg)
+    assert others
+    assert [one.quality for one in found.candidates] == sorted(
+        (one.quality for one in found.candidates), reverse=True
+    )
+
+
+def test_all_instances_are_listed_each_once(bundle: Bundle) -> None:
+    places = {
+        (150.0, 130.0): 20.0,
+        (330.0, 250.0): -75.0,
+        (376.0, 252.0): -75.0,
+        (520.0, 380.0): 160.0,
+    }
+    scene = table(2)
+    for center, turn in places.items():
+        scene = lay(toy(), scene, center, turn)
+    found = Told(bundle, described(), *places).locate_all(scene)
+    assert len(found) == len(places)
+    for center, turn in places.items():
+        nearest = min(found, key=lambda one: math.dist(one.center_px, center))
+        assert math.dist(nearest.center_px, center) < 1.5
+        assert turn_error(nearest.full_angle_deg, turn) < 1.5
+    assert [one.quality for one in found] == sorted((one.quality for one in found), reverse=True)
+    assert Told(bundle, described(), (300.0, 200.0)).locate_all(table(3)) == []
+
+
+def test_an_object_without_a_front_has_no_full_turn(bundle: Bundle) -> None:
+    scene = lay(toy(front=False), table(2), (300.0, 200.0), 40)
+    found, _ = Told(bundle, described(toy(front=False)), (300.0, 200.0)).locate(scene)
+    assert turn_error(found.angle_deg, 40, 180) < 0.5
+    assert found.full_angle_deg is None
+    assert found.full_angle_confidence is not None
+    assert 0.5 <= found.full_angle_confidence < 0.75
+
+
+def test_where_the_patch_fits_weakly_the_network_says_centre_and_turn(bundle: Bundle) -> None:
+    """A decision that finds whatever there is, and an object that looks like nothing taught."""
+    scene = lay(toy()[..., [2, 0, 1, 3]][:, ::-1].copy(), table(2), (300.0, 200.0), light=0.15)
+    told = Told(bundle, described(decision=by_correlation(-10)), (304.0, 196.0))
+    told.angle_rad = math.radians(25)
+    found, _ = told.locate(scene)
+    assert found.found
+    assert found.refined_by == "network"
+    cell = Detection(True, found.quality, (304.0, 192.0), (0.0, 0.0), 0.0)
+    expected = refine(cell, scene, told.heatmap, 0.0)
+    assert found.center_px == pytest.approx(expected.center_px)
+    assert found.angle_deg == pytest.approx(25, abs=0.01)
+    assert (found.full_angle_deg, found.full_angle_confidence) == (None, None)
+
+
+def test_without_a_decision_the_network_finds_and_a_strong_patch_refines(bundle: Bundle) -> None:
+    about = replace(described(), decision=None)
+    scene = lay(toy(), table(2), (300.3, 200.6), -100)
+    found, _ = Told(bundle, about, (306.0, 207.0)).locate(scene)
+    assert found.quality > 0.9
+    assert found.refined_by == "patch"
+    assert math.dist(found.center_px, (300.3, 200.6)) < 0.5
+    assert turn_error(found.full_angle_deg, -100) < 0.5
+    nothing, _ = Told(bundle, about, (306.0, 207.0)).locate(table(3))
+    assert nothing.found
+    assert nothing.refined_by == "network"
+    both = Told(bundle, about, (306.0, 207.0), (500.0, 400.0)).locate_all(scene)
+    assert [one.refined_by for one in both] == ["patch", "network"]
+
+
+def test_scenes_are_scaled_and_answered_in_their_own_pixels(bundle: Bundle) -> None:
+    center, scale = (900.0, 700.0), 0.25
+    scene = lay(toy(), table(2, (1200, 1600)), center, 35, 4)
+    seen = tuple((value + 0.5) * scale - 0.5 for value in center)
+    told = Told(bundle, described(scale=scale), (seen[0], seen[1]))
+    found, heatmap = told.locate(scene)
+    assert heatmap.shape == (3, 11, 18)
+    assert math.dist(found.center_px, center) < 2
+    assert found.displacement_px == pytest.approx((100, 100), abs=2)
+    assert turn_error(found.full_angle_deg, 35) < 0.5
+    assert found.scale == scale
+    assert found.candidates[0].center_px == found.center_px
+    (only,) = told.locate_all(scene)
+    assert only.center_px == found.center_px
+    with pytest.raises(QsgmError, match=r"640x480 px has 160x120 at the scale of 'toy': expected"):
+        told.locate(DEMONSTRATION)
+
+
+def test_of_several_looks_the_one_that_fits_is_taken_and_its_turn_added(bundle: Bundle) -> None:
+    back = toy()[..., [2, 1, 0, 3]]
+    frame = lay(back, table(1), CENTER)
+    other = View(cut_patch(frame, CENTER), math.radians(30), whole=False)
+    about = described()
+    about = replace(about, views=(*about.views, other))
+    scene = lay(back, table(3), (250.0, 220.0), 50)
+    found, _ = Told(bundle, about, (250.0, 220.0)).locate(scene)
+    assert math.dist(found.center_px, (250, 220)) < 0.5
+    assert turn_error(found.angle_deg, 80, 180) < 0.5
+    assert found.full_angle_deg is None
+    front, _ = Told(bundle, about, CENTER).locate(DEMONSTRATION)
+    assert turn_error(front.full_angle_deg, 0) < 0.3
+
+
+def test_looks_decision_and_provenance_read_back_as_they_were(
+    bundle: Bundle, tmp_path: Path
+) -> None:
+    about = described(scale=0.5)
+    about = replace(about, views=(*about.views, replace(about.views[0], turn_rad=0.5, whole=False)))
+    save_object(tmp_path / "toy", about, bundle.network_with({}), {})
+    again = load_object(tmp_path / "toy").description
+    assert (again.scale, again.made) == (0.5, {"seed": 4})
+    for got, kept in zip(again.views, about.views, strict=True):
+        assert (got.turn_rad, got.whole) == (kept.turn_rad, kept.whole)
+        assert (got.patch.center_px, got.patch.cut_out) == (kept.patch.center_px, True)
+        np.testing.assert_array_equal(got.patch.image, kept.patch.image)
+        np.testing.assert_array_equal(got.patch.mask, kept.patch.mask)
+    assert again.decision is not None
+    assert again.decision.to_json() == by_correlation().to_json()
+    values = json.loads((tmp_path / "toy" / DESCRIPTION).read_text())
+    assert values["threshold"] == {"quality": 0.5, "false_alarm_rate": 0.02}
+    assert {path.name for path in (tmp_path / "toy").iterdir()} == {
+        "SHA256SUMS",
+        "network.onnx",
+        "object.json",
+        "report.json",
+        "patch.png",
+        "patch_2.png",
+    }
+
+
+def test_an_object_of_the_first_version_is_read_and_found_as_ever(
+    saved: Path, frame: NDArray[np.uint8]
+) -> None:
+    path = saved / DESCRIPTION
+    new = json.loads(path.read_text())
+    old = {key: new[key] for key in ("format", "sha256", "name", "encoding", "offset_rad")}
+    path.write_text(json.dumps(old | {"version": 1}))
+    tuned = load_object(saved)
+    assert tuned.description == MUG
+    heatmap = tuned.heatmap(frame)
+    expected = locate(heatmap, (480, 640), 0.25)
+    if expected.found:
+        expected = refine(expected, frame, tuned.heatmap, 0.25)
+    found, _ = tuned.locate(frame)
+    assert replace(found, candidates=()) == expected
+    assert all(one.found for one in tuned.locate_all(frame))
+    with pytest.raises(QsgmError, match=r"kept no picture of it; tune the object again .* a frame"):
+        tuned.as_other()
+
+
+def test_a_missing_or_altered_patch_is_refused(bundle: Bundle, tmp_path: Path) -> None:
+    save_object(tmp_path / "toy", described(), bundle.network_with({}), {})
+    path = tmp_path / "toy" / "patch.png"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert "patch.png is missing or altered; tune the object again" in refusal(tmp_path / "toy")
+    path.unlink()
+    assert "patch.png is missing or altered" in refusal(tmp_path / "toy")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scale": 0.0},
+        {"scale": 1e9},
+        {"scale": float("nan")},
+        {"views": [1]},
+        {"views": [{}]},
+        {"views": [{"file": "../network.onnx", "sha256": "0"}]},
+        {"decision": {"evidence": []}},
+    ],
+)
+def test_a_description_of_version_2_that_says_nonsense_is_refused(
+    bundle: Bundle, tmp_path: Path, change: dict[str, object]
+) -> None:
+    save_object(tmp_path / "toy", described(), bundle.network_with({}), {})
+    path = tmp_path / "toy" / DESCRIPTION
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    assert "again" in refusal(tmp_path / "toy")
+
+
+@pytest.mark.parametrize("key", ["scale", "views", "made"])
+def test_a_description_of_version_2_lacks_none_of_its_keys(saved: Path, key: str) -> None:
+    path = saved / DESCRIPTION
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in values.items() if k != key}))
+    assert f"'{key}' holds nothing" in refusal(saved)
