@@ -210,6 +210,10 @@ def test_only_elongated_objects_count_for_turns_and_unique_ones_for_the_way_roun
     found = errors([hit, round_one])
     assert found["median_turn_error_deg"] == pytest.approx(4)
     assert found["full_turn_right"] == 1
+    assert math.isnan(found["fallback"])
+    coarse = replace(hit, answer=replace(hit.answer, refined=False))
+    fine = replace(hit, answer=replace(hit.answer, refined=True))
+    assert errors([coarse, fine, fine, fine])["fallback"] == 0.25
     assert math.isnan(errors([round_one])["full_turn_right"])
 
 
@@ -234,8 +238,12 @@ class Knowing:
 
 @pytest.fixture(scope="module")
 def plan(frames_folder: Path) -> ScenePlan:
-    """Two conditions of a bar and a disk."""
-    subjects = tuple(subjects_of(list_frames(frames_folder)))
+    """Two conditions of a bar and a disk, in small frames."""
+    part = np.s_[120:360, 160:480]
+    subjects = tuple(
+        replace(subject, frame=subject.frame[part], mask=subject.mask[part])
+        for subject in subjects_of(list_frames(frames_folder))
+    )
     return ScenePlan(subjects, (0, 1), ("same_table", "hidden"), count=2)
 
 
@@ -330,7 +338,7 @@ def test_a_rival_is_asked_about_every_scene(tmp_path: Path, plan: ScenePlan) -> 
     )
     subject = plan.subjects[0]
     first, second = rival.answers(subject, [subject.frame, subject.frame])
-    assert first == Answer(False, 0.0, (320.0, 240.0), 10.0, 10.0, None)
+    assert first == Answer(False, 0.0, (160.0, 120.0), 10.0, 10.0, None)
     assert second.quality == -math.inf
 
 
@@ -393,7 +401,7 @@ def test_kept_scenes_come_with_their_truth(tmp_path: Path, plan: ScenePlan) -> N
     assert [item["condition"] for item in told] == 2 * ["same_table"] + 2 * ["hidden"]
     assert [item["center_px"] is None for item in told] == [False, True, False, True]
     for item in told:
-        assert cv2.imread(str(tmp_path / "bar" / item["file"])).shape == (480, 640, 3)
+        assert cv2.imread(str(tmp_path / "bar" / item["file"])).shape == (240, 320, 3)
     assert cv2.imread(str(tmp_path / "bar" / "mask.png")).max() == 255
 
 

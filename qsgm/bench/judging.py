@@ -48,6 +48,7 @@ class Answer:
     turn_deg: float  # since the demonstration, counter-clockwise, modulo 180
     full_turn_deg: float | None = None  # over the full circle, where the method tells
     seconds: float | None = None
+    refined: bool | None = None  # False: by the fallback only; None: the method has none
 
 
 @dataclass(frozen=True)
@@ -207,15 +208,20 @@ def shares(tally: Tally) -> dict[str, float]:
 
 
 def errors(results: Sequence[Judged]) -> dict[str, float]:
-    """Errors of right places: centre, turn of elongated objects, way round of unique ones."""
+    """Errors of right places: centre, turn of elongated objects, way round of unique ones.
+
+    And the share of them where the refinement's fallback ran.
+    """
     right = [result for result in results if result.outcome == "right_place"]
     turns = [r.turn_error_deg for r in right if r.truth.elongated is not False]
     full = [r.full_turn_error_deg for r in right if r.truth.unique]
-    ways = [float(error < 90) for error in full if error is not None]
+    ways = [error < 90 for error in full if error is not None]
+    fallbacks = [not r.answer.refined for r in right if r.answer.refined is not None]
     return {
         "median_center_error_px": _median([result.center_error_px for result in right]),
         "median_turn_error_deg": _median(turns),
         "full_turn_right": float(np.mean(ways)) if ways else math.nan,
+        "fallback": float(np.mean(fallbacks)) if fallbacks else math.nan,
     }
 
 

@@ -135,6 +135,7 @@ def _answer(detection: Detection, seconds: float) -> Answer:
         detection.quality,
         detection.center_px,
         detection.angle_deg,
-        getattr(detection, "full_angle_deg", None),
+        detection.full_angle_deg,
         seconds,
+        detection.refined_by == "patch",
     )

@@ -32,7 +32,8 @@ LEGEND = (
     f"right: found within {ON_OBJECT_PX:.0f} px of the true centre; thing: found on another thing; "
     "backgr: found elsewhere; alarm: found though absent; all in % of the scenes with or without "
     "the object. ROC: area, EER: equal error rate [%], of the quality. centre [px] and turn [°, "
-    "modulo 180, elongated objects]: median errors of right places; way: right way round [%]"
+    "modulo 180, elongated objects]: median errors of right places; way: right way round [%]; "
+    "fallback: of refining them"
 )
 # (key, heading, factor, digits)
 _COLUMNS = (
@@ -152,7 +153,7 @@ def figures(
         low, high = ranges[name]
         found[name] = number(values[name], 4)
         found[f"{name}_95"] = [number(low, 4), number(high, 4)]
-    digits = {"full_turn_right": 4}
+    digits = {"full_turn_right": 4, "fallback": 4}
     return found | {
         name: number(value, digits.get(name, 2)) for name, value in errors(results).items()
     }
@@ -225,7 +226,7 @@ def difference_text(difference: dict[str, Any]) -> str:
 
 
 def intervals_line(values: dict[str, Any]) -> str:
-    """The pooled figures' 95 % intervals."""
+    """The pooled figures' 95 % intervals, and how often a right place was not refined."""
     row = values[POOLED]
     shown = (("right", "right_place", 100, 1), ("alarm", "false_alarm", 100, 1))
     texts = [
@@ -233,7 +234,8 @@ def intervals_line(values: dict[str, Any]) -> str:
         f"{_cell(row[f'{key}_95'][1], factor, digits)}"
         for label, key, factor, digits in (*shown, ("ROC", "roc_area", 1, 3))
     ]
-    return f"pooled, 95 % intervals: {', '.join(texts)}"
+    fallback = _cell(row["fallback"], 100, 1)
+    return f"pooled, 95 % intervals: {', '.join(texts)}; fallback ran in {fallback} %"
 
 
 def _rows(values: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -288,6 +290,7 @@ def _scene_json(result: Judged) -> dict[str, Any]:
         "center_px": _point_json(answer.center_px),
         "angle_deg": number(answer.turn_deg, 2),
         "full_angle_deg": None if full is None else number(full, 2),
+        "refined": answer.refined,
         "center_error_px": number(result.center_error_px, 2),
         "turn_error_deg": number(result.turn_error_deg, 2) if present else None,
         "on": result.spot,
