@@ -28,9 +28,9 @@ from qsgm.grasp.patch import PATCH_PX, Patch
 
 CELL_PX = 16
 # Cells of the heatmap that the patch is laid over, and how many of these it is laid over finely.
-PROPOSED, JUDGED = 12, 3
+PROPOSED, JUDGED = 12, 4
 # What the network's log odds count beside a correlation when the few are chosen.
-_QUALITY_WEIGHT = 0.03
+_QUALITY_WEIGHT = 0.02
 # Of each of the few, so many turns are tried at a quarter of the resolution.
 _TURNS = 2
 # Closer than that, two candidates are the same.

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +15,10 @@ from qsgm.grasp.patch import PATCH_PX, Patch
 _FEATURELESS_VARIANCE = 3 * NOISE_VARIANCE
 # A patch that is that much like itself at every turn is round.
 _ROUND_CORRELATION = 0.9
+# A plain one is round if its smallest rectangle is that much of a square.
+_ROUND_SHARE = 0.85
+_RIM_PX = 9  # within half of that from its outline an object may show some table
+_INNER_SHARE = 0.2
 _TURNS = tuple((float(turn), 1.0) for turn in np.deg2rad(np.arange(0, 360, 15)))
 _MIDDLE_PX = (PATCH_PX - 1) / 2
 
@@ -33,12 +38,23 @@ def likeness_of(patch: Patch) -> Likeness:
     appearance = Appearance.of(patch)
     _, lead = best_fit(appearance, patch.image, (_MIDDLE_PX, _MIDDLE_PX))
     by_turn = likeness_by_turn(appearance, patch.image)
+    long_px, short_px = patch.span_px
+    featureless = inner_variance(patch) < _FEATURELESS_VARIANCE
+    same_outline = featureless and short_px > _ROUND_SHARE * long_px
     return Likeness(
         patch.cut_out,
-        float(appearance.aligner.variance) < _FEATURELESS_VARIANCE,
-        bool(by_turn.min() > _ROUND_CORRELATION),
+        featureless,
+        same_outline or bool(by_turn.min() > _ROUND_CORRELATION),
         confidence_of(lead) < LEAST_CONFIDENCE,
     )
+
+
+def inner_variance(patch: Patch) -> float:
+    """Of the object's pixels, all channels together, without its rim where that leaves enough."""
+    inner = cv2.erode(patch.mask, np.ones((_RIM_PX, _RIM_PX), np.uint8)) > 0
+    solid = patch.mask > 0
+    enough = inner.sum() > _INNER_SHARE * solid.sum()
+    return float(patch.image[inner if enough else solid].astype(np.float64).var(axis=0).sum())
 
 
 def likeness_by_turn(appearance: Appearance, image: NDArray[np.uint8]) -> NDArray[np.float32]:
