@@ -1,21 +1,25 @@
 """Fine-tuning end to end on a small bundle: deterministic, honest, and the same at every seam."""
 
+import hashlib
 import json
 import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from toys import bump, by_correlation, lay, table, toy
 
 from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object, preparing, probing
 from qsgm.angles import encode_angle
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, Precision, head_file
-from qsgm.crops import CROPS, TRAIN_CROPS
+from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
 from qsgm.finetuning import FinetuneResult, peak_activation_bytes, train
+from qsgm.grasp.others import other_in
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.preparing import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
 from qsgm.quantize import SgmRanges, constants, quantize_sgm
@@ -432,3 +436,153 @@ def test_a_number_that_is_not_finite_becomes_null_not_nan(result: FinetuneResult
     broken = replace(result, accuracy=Accuracy(1.0, math.nan))
     values = json.loads(to_json(finetune_json(broken, "mug", Path("mug"))))
     assert values["angle_mae_deg"] is None
+
+
+def toy_frame(turn_deg: float = 0.0, seed: int = 0) -> Frame:
+    return lay(toy(), table(seed), (320.0, 240.0), turn_deg)
+
+
+def test_accuracy_is_told_with_other_things_on_the_crops_and_without(
+    bundle: Bundle, result: FinetuneResult
+) -> None:
+    prepared, accuracy = result.prepared, result.accuracy
+    rows = np.arange(TRAIN_CROPS, CROPS)
+    weights = {
+        name: to_step_layout(value) if value.ndim > 1 else value
+        for name, value in result.weights.items()
+    }
+    head = bundle.session(head_file(3))
+    outputs = head.run(None, {"features": prepared.features[rows], **weights})[0]
+    right = (outputs[:, 0] > 0.5) == (prepared.labels[rows, 0] > 0)
+    addition, negative = prepared.addition[rows], prepared.labels[rows, 0] == 0
+    assert accuracy.detection_accuracy == pytest.approx(right.mean())
+    assert accuracy.detection_accuracy_plain == pytest.approx(right[addition == 0].mean())
+    assert accuracy.told_apart == pytest.approx(right[negative & (addition == 1)].mean())
+    values = finetune_json(result, "mug", Path("mug"))
+    for place in (values, values["zero_shot"]):
+        assert {"detection_accuracy_plain", "angle_mae_deg_plain", "told_apart"} <= set(place)
+
+
+def test_a_bundle_without_things_gives_crops_of_the_frame_alone(
+    frame: Frame, bundle: Bundle
+) -> None:
+    files = {k: v for k, v in bundle.manifest["files"].items() if k != "distractors.png"}
+    old = replace(bundle, manifest=bundle.manifest | {"files": files})
+    assert old.distractors() is None
+    result = finetune(frame, old, replace(SHORT, epochs=1))
+    plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
+    crops = cut_crops(frame, plan[:20])
+    expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
+    np.testing.assert_array_equal(result.prepared.features[:20], expected)
+    accuracy = result.accuracy
+    assert accuracy.detection_accuracy_plain == accuracy.detection_accuracy
+    assert accuracy.told_apart is None
+    assert "no other things" in " ".join(result.verdict.notes)
+
+
+def test_several_demonstrations_share_one_meaning_of_the_angle(bundle: Bundle) -> None:
+    turn = 70.0
+    frames = [toy_frame(), toy_frame(turn, 1)]
+    result = finetune(frames, bundle, replace(SHORT, epochs=1))
+    prepared = result.prepared
+    crops = crop_source(
+        [Demonstration(frame, (320.0, 240.0)) for frame in frames],
+        bundle.distractors(),
+        np.random.default_rng(0),
+    )
+    true = crops.plan.turn_rad + np.radians(turn) * crops.shown + prepared.offset_rad
+    positive = crops.plan.quality > 0
+    np.testing.assert_allclose(
+        prepared.labels[positive, 1:], encode_angle(true[positive]), atol=0.02
+    )
+    assert set(crops.shown) == {0, 1}
+    (first, second) = finetune_json(result, "toy", Path("toy"))["demonstrations"]
+    assert first == {"turn_deg": 0.0}
+    assert second["turn_deg"] == pytest.approx(turn, abs=0.5)
+    assert len(result.tuned_object().description.views) == 1
+
+
+def test_a_demonstration_that_looks_different_is_aligned_by_the_network_and_kept(
+    bundle: Bundle, tmp_path: Path
+) -> None:
+    back = lay(toy()[..., [2, 1, 0, 3]], table(1), (320.0, 240.0), 70)
+    result = finetune([toy_frame(), back], bundle, replace(SHORT, epochs=1))
+    first, second = result.prepared.orientation.of_each_rad
+    assert first == result.prepared.offset_rad
+    result.save(tmp_path / "toy", "toy")
+    one, other = load_object(tmp_path / "toy").description.views
+    assert (one.turn_rad, one.whole) == (0, True)
+    assert (other.turn_rad, other.whole) == (pytest.approx(second - first), False)
+    assert finetune_json(result, "toy", Path("toy"))["demonstrations"][1] == {"turn_deg": None}
+
+
+def test_things_that_are_named_are_put_on_the_crops(bundle: Bundle) -> None:
+    other = other_in(Demonstration(toy_frame(), (320.0, 240.0)))
+    frame = lay(toy()[..., [1, 2, 0, 3]], table(2), (320.0, 240.0))
+    plain, named = (prepare(frame, bundle, SHORT, others=some) for some in ([], [other]))
+    again = prepare(frame, bundle, SHORT, others=[other])
+    assert not np.array_equal(plain.features, named.features)
+    np.testing.assert_array_equal(again.features, named.features)
+    np.testing.assert_array_equal(plain.addition, named.addition)
+    alone = (plain.addition == 0) | (plain.addition == 2)
+    np.testing.assert_array_equal(plain.features[alone], named.features[alone])
+    assert named.others_sha256 == (other.sha256,)
+
+
+def test_a_photograph_with_a_large_object_is_taught_and_found_in_its_own_pixels(
+    bundle: Bundle, tmp_path: Path
+) -> None:
+    """12 megapixels, an object of 800 px."""
+    small = lay(toy(), table(0, (378, 504)), (252.0, 189.0), 25, 100 / 90)
+    photograph = cv2.resize(small, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC)
+    manifest = bundle.manifest | {"decision": by_correlation().to_json()}
+    result = finetune(photograph, replace(bundle, manifest=manifest), replace(SHORT, epochs=1))
+    values = finetune_json(result, "toy", Path("toy"))
+    assert values["span_px"] == pytest.approx(800, rel=0.1)
+    assert values["scale"] == pytest.approx(90 / 800, rel=0.1)
+    shown = result.prepared.shown.demonstrations[0]
+    assert max(shown.frame.shape) < 520
+    result.save(tmp_path / "toy", "toy")
+    tuned = load_object(tmp_path / "toy")
+    assert tuned.description.scale == pytest.approx(values["scale"], abs=1e-4)
+    monkey = bump([shown.center_px], shown.frame.shape[:2])
+    tuned.heatmap = lambda _frame: monkey  # type: ignore[method-assign]
+    found, _ = tuned.locate(photograph)
+    assert found.refined_by == "patch"
+    assert math.dist(found.center_px, (2016, 1512)) < 8
+    assert abs(found.angle_deg) < 0.5
+
+
+def test_an_object_of_the_usual_size_is_not_scaled(frame: Frame, result: FinetuneResult) -> None:
+    shown = result.prepared.shown
+    assert shown.scale == 1
+    assert shown.demonstrations[0].frame is frame
+
+
+def test_what_the_object_was_made_from_is_kept(
+    frame: Frame, bundle_folder: Path, result: FinetuneResult, tmp_path: Path
+) -> None:
+    result.save(tmp_path / "mug", "mug")
+    made = json.loads((tmp_path / "mug" / "object.json").read_text())["made"]
+    manifest = (bundle_folder / "manifest.json").read_bytes()
+    assert made["bundle_sha256"] == hashlib.sha256(manifest).hexdigest()
+    assert made["frames_sha256"] == [hashlib.sha256(frame.tobytes()).hexdigest()]
+    assert made["seed"] == 0
+    assert {"qsgm", "onnxruntime", "opencv"} <= set(made)
+
+
+def test_a_run_that_ends_poor_is_warned_about(bundle: Bundle) -> None:
+    """A checkerboard of 2 px in a bundle of random weights: nothing can come of it."""
+    board = np.kron(np.indices((240, 320)).sum(axis=0) % 2 * 255, np.ones((2, 2)))
+    frame = np.repeat(board[..., None], 3, axis=2).astype(np.uint8)
+    result = finetune(frame, bundle, replace(SHORT, epochs=1))
+    assert not result.verdict.good
+    values = finetune_json(result, "board", Path("board"))
+    assert values["verdict"]["good"] is False
+    assert values["verdict"]["reasons"]
+    assert set(values["verdict"]["reasons"]) <= set(values["warnings"])
+
+
+def test_no_frame_at_all_is_a_programming_error(bundle: Bundle) -> None:
+    with pytest.raises(ValueError, match="at least one frame"):
+        finetune([], bundle)

@@ -76,14 +76,15 @@ def plan_clutter(
     thing = np.where(negative, draw < THING_SHARE, draw < BESIDE_SHARE)
     edge = negative & ~thing & (draw < THING_SHARE + EDGE_SHARE)
     pastes = plan_pastes(rng, count, sprites)
-    if 0 < named < sprites:
-        pastes = replace(pastes, sprite=_often_named(rng, count, sprites, named))
     beside = HALF_CROP_PX + _ring(rng, count)
     centers = np.where(negative[:, None], pastes.center_px, beside).astype(np.float32)
+    edges = plan_edges(rng, count)
+    # Last, so that all else is the same whatever is named.
+    sprite = _often_named(rng, count, sprites, named) if 0 < named < sprites else pastes.sprite
     return ClutterPlan(
         addition=np.select([thing, edge], [Addition.THING, Addition.EDGE]).astype(np.uint8),
-        things=replace(pastes, center_px=centers),
-        edges=plan_edges(rng, count),
+        things=replace(pastes, center_px=centers, sprite=sprite),
+        edges=edges,
     )
 
 

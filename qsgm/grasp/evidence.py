@@ -28,6 +28,8 @@ NAMES = (
     "scale",  # |log|
     "agreement_low",  # of six parts of the object: the two worst correlations' mean
     "agreement_middle",  # and the median
+    "agreement_high",  # and the mean of the three best
+    "seen_correlation",  # over the four best parts alone, as if the others were hidden
     "residual",  # median colour difference once brightness and contrast are fitted
     "contrast",  # of the object to what lies around it
     "detail",  # log of the taught object's own variance
@@ -36,6 +38,7 @@ NAMES = (
     "lead",  # over the best fit at another turn
 )
 _PARTS = 6
+_SHOWN_PARTS = 4  # of an object that is partly hidden
 _GRADIENT_NOISE = 4.0  # levels
 _RING_PX = 5  # of the level
 _LARGEST_LOGIT = 8.0
@@ -96,7 +99,9 @@ def evidence(
         (variances + NOISE_VARIANCE) * (taught_variances + NOISE_VARIANCE)
     )
     variance, taught_variance = float(variances[0]), float(taught_variances[0])
-    parts = np.sort(correlations[1:])
+    order = np.argsort(correlations[1:], kind="stable")
+    parts = correlations[1:][order]
+    shown = reference.parts[order[-_SHOWN_PARTS:]].mean(axis=0)
     gains = np.log((mean + 8) / (taught_mean + 8))
     ring = _means(seen, reference.ring)
     odds = np.log(max(quality, 1e-6) / max(1 - quality, 1e-6))
@@ -111,6 +116,8 @@ def evidence(
         abs(np.log(fit.scale)),
         parts[:2].mean(),
         np.median(parts),
+        parts[-3:].mean(),
+        _correlation(seen - _means(seen, shown), image - _means(image, shown), shown),
         _residual(flat, taught_flat, mask, variance, taught_variance),
         np.abs(ring - mean).max() / 50,
         np.log(taught_variance + NOISE_VARIANCE),
