@@ -48,7 +48,7 @@ class Difficulty:
 # To learn from: everything at once.
 HARD = Difficulty((0, 1, 2, 3, 4), (0.6, 0.3, 0.1), 0.3, 0.4, 0.3, 0.25, 0.2)
 # To decide on, as scenes come: mostly one thing at a time.
-USUAL = Difficulty((0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.2, 0.12, 0.12, 0.1)
+USUAL = Difficulty((0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.15, 0.15, 0.12, 0.1)
 
 
 @dataclass(frozen=True)
