@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.bench.composing import Condition, Scene
+from qsgm.bench.composing import Scene
 from qsgm.bench.judging import Judged, Outcome, Spot
 
 Picture = NDArray[np.uint8]
@@ -52,9 +52,9 @@ class Album:
     """Keeps a few scenes with their answers drawn: examples, and ways to go wrong."""
 
     subjects: tuple[str, ...]  # names of those that are taught, in their order
-    examples: dict[Condition, list[Picture]] = field(default_factory=dict)
+    examples: dict[str, list[Picture]] = field(default_factory=dict)
     failures: dict[str, Picture] = field(default_factory=dict)
-    _kept: dict[tuple[Condition, Outcome], int] = field(default_factory=dict)
+    _kept: dict[tuple[str, Outcome], int] = field(default_factory=dict)
 
     def look(self, scene: Scene, judged: Judged) -> None:
         """Keep a scene if it is one of the examples, or among the first to go wrong this way."""
@@ -114,7 +114,7 @@ def draw_scenes(values: dict[str, Any], album: Album) -> Picture:
         top = _TOP + k * _ROW
         _rule(page, top, _FAINT if k == len(rows) - 1 else _RULE)
         _row(page, name.replace("_", " "), row, top, bold=k == len(rows) - 1)
-        for i, thumb in enumerate(album.examples.get(name, ())):  # type: ignore[call-overload]
+        for i, thumb in enumerate(album.examples.get(name, ())):
             _paste(page, thumb, _THUMB_X + i * _THUMB_STEP, top + (_ROW - _THUMB[1]) // 2)
     _legend(page, height - 26)
     small = cv2.resize(page, (_WIDTH, height), interpolation=cv2.INTER_AREA)
