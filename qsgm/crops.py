@@ -70,7 +70,7 @@ def plan_crops(
         QsgmError: the window around the centre does not lie inside the frame, or the frame has no
             room for windows beside it.
     """
-    _check_center(frame_hw, center_px)
+    check_center(frame_hw, center_px)
     _check_room(frame_hw, center_px)
     quality = rng.permutation(np.arange(count) % 2).astype(np.float32)
     jitter = rng.uniform(-POSITIVE_JITTER_PX, POSITIVE_JITTER_PX, (count, 2))
@@ -146,13 +146,17 @@ def label_crops(
     return np.concatenate([plan.quality[:, None], angle * plan.quality[:, None]], axis=1)
 
 
-def _check_center(frame_hw: tuple[int, int], center_px: tuple[float, float]) -> None:
+def check_center(
+    frame_hw: tuple[int, int], center_px: tuple[float, float], margin_px: float = HALF_CROP_PX
+) -> None:
+    """Refuse a point (x, y) that is closer than a margin to the border of a frame.
+
+    Raises:
+        QsgmError: says how large the margin has to be in the end.
+    """
     height, width = frame_hw
     x, y = center_px
-    inside = (HALF_CROP_PX <= x <= width - HALF_CROP_PX) and (
-        HALF_CROP_PX <= y <= height - HALF_CROP_PX
-    )
-    if not inside:
+    if not (margin_px <= x <= width - margin_px and margin_px <= y <= height - margin_px):
         raise QsgmError(
             f"the object's centre ({x:g}, {y:g}) is closer than {HALF_CROP_PX} px to the border "
             f"of the {width}x{height} frame; move the camera or pass another --center"

@@ -11,6 +11,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import numpy_helper
+from toys import by_correlation
 
 from qsgm import QsgmError, load_bundle
 from qsgm.blocks import one_block, parse_blocks, single_layers
@@ -36,6 +37,42 @@ def test_a_whole_bundle_loads(bundle: Bundle) -> None:
     assert bundle.most_layers == 6
     singles = ("6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6")
     assert bundle.blocks == (*singles, "4,5-6", "1-4,5,6")
+
+
+def test_the_things_that_come_with_a_bundle_are_read_and_checked(
+    bundle: Bundle, own_bundle: Path
+) -> None:
+    things = bundle.distractors()
+    assert things is not None
+    assert len(things) == 2
+    path = own_bundle / "distractors.png"
+    path.write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(QsgmError, match=r"distractors\.png is not the file the manifest describes"):
+        load_bundle(own_bundle)
+
+
+def test_a_bundle_of_before_has_neither_things_nor_a_decision(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["files"]["distractors.png"]
+    path.write_text(json.dumps(manifest))
+    (own_bundle / "distractors.png").unlink()
+    old = load_bundle(own_bundle)
+    assert old.distractors() is None
+    assert old.decision() is None
+
+
+def test_a_bundles_decision_is_read_or_refused_when_the_bundle_is(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps(manifest | {"decision": by_correlation().to_json()}))
+    decision = load_bundle(own_bundle).decision()
+    assert decision is not None
+    assert decision.to_json() == by_correlation().to_json()
+    assert load_bundle(own_bundle).sha256() == hashlib.sha256(path.read_bytes()).hexdigest()
+    path.write_text(json.dumps(manifest | {"decision": by_correlation().to_json() | {"bias": "x"}}))
+    with pytest.raises(QsgmError, match=r"manifest\.json: the decision's numbers do not fit"):
+        load_bundle(own_bundle)
 
 
 def test_names_of_steps() -> None:

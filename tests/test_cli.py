@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from toys import by_correlation, lay, table, toy
 
 from qsgm import __version__, cli, finetuning, paths
 from qsgm.bundle import NETWORK, trunk_file
@@ -152,7 +153,11 @@ def test_finetune_prints_one_json_object_with_the_stable_keys(
     }
     assert (values["seed"], values["output"]) == (5, str(folder))
     assert values["bundle"] == str(bundle_folder)
-    assert set(values["zero_shot"]) == {"detection_accuracy", "angle_mae_deg"}
+    accuracy = {"detection_accuracy", "angle_mae_deg", "told_apart"}
+    accuracy |= {"detection_accuracy_plain", "angle_mae_deg_plain"}
+    assert set(values["zero_shot"]) == accuracy <= values.keys()
+    assert set(values["verdict"]) == {"good", "reasons", "notes"}
+    assert (values["scale"], values["others"]) == (1.0, 0)
     assert set(values["fidelity"]) == {"4", "5"}
     assert all(layer.keys() >= FIDELITY_KEYS for layer in values["fidelity"].values())
     assert values["seconds"].keys() >= {"crops", "features", "tuning", "probes", "total"}
@@ -175,7 +180,16 @@ def test_finetune_and_predict_for_people(
 ) -> None:
     taught = qsgm("finetune", "--epochs", 1, "--bundle", bundle_folder, frame_path)
     assert taught.code == 0, taught.err
-    for text in ("untouched", "tuned", "cos", "clipped", "seconds: crops", "tuned object: "):
+    texts = (
+        "untouched",
+        "tuned",
+        "cos",
+        "clipped",
+        "verdict: ",
+        "seconds: crops",
+        "tuned object: ",
+    )
+    for text in texts:
         assert text in taught.out
     folder = tmp_path / "data" / "qsgm" / "objects" / "bar"
     assert str(folder) in taught.out
@@ -197,6 +211,12 @@ def test_predict_prints_one_json_object_with_the_stable_keys(
     assert -90 < values["angle_deg"] <= 90
     x, y = values["center_px"]
     assert values["displacement_px"] == pytest.approx([x - 320, y - 240], abs=0.011)
+    assert values["refined_by"] in ("patch", "network")
+    assert values["scale"] == 1
+    first = values["candidates"][0]
+    keys = ("center_px", "quality", "angle_deg", "full_angle_deg")
+    assert first == {key: values[key] for key in keys}
+    assert "objects" not in values
 
 
 def test_the_object_tuned_last_is_the_one_predict_uses(
@@ -352,9 +372,92 @@ def test_a_value_out_of_range_is_a_usage_error_in_one_line(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("arguments", [(), ("a.png", "b.png")])
-def test_a_wrong_number_of_frames_is_a_usage_error(qsgm: Run, arguments: tuple[str, ...]) -> None:
-    assert_refused(qsgm("finetune", *arguments), 2)
+def test_no_frame_at_all_is_a_usage_error(qsgm: Run) -> None:
+    assert_refused(qsgm("finetune"), 2)
+    assert_refused(qsgm("predict", "a.png", "b.png"), 2)
+
+
+@pytest.fixture
+def toy_paths(tmp_path: Path) -> list[Path]:
+    """A toy, the same one turned on another table, and another thing."""
+    frames = [
+        lay(toy(), table(), (320.0, 240.0)),
+        lay(toy(), table(1), (260.0, 200.0), 70),
+        lay(toy()[..., [2, 1, 0, 3]], table(2), (320.0, 240.0)),
+    ]
+    paths = [tmp_path / f"{name}.png" for name in ("toy", "turned", "other")]
+    for path, frame in zip(paths, frames, strict=True):
+        cv2.imwrite(str(path), frame)
+    return paths
+
+
+def test_several_frames_are_demonstrations_of_one_object(
+    qsgm: Run, toy_paths: list[Path], bundle_folder: Path, tmp_path: Path
+) -> None:
+    start = ("finetune", "--json", "--epochs", 0, "--bundle", bundle_folder, "-o", tmp_path / "o")
+    centers = ("--center", "320,240", "--center", "260,200")
+    values = qsgm(*start, *centers, *toy_paths[:2]).json
+    assert values["object"] == "toy"
+    assert [one["turn_deg"] for one in values["demonstrations"]] == [
+        0,
+        pytest.approx(70, abs=0.5),
+    ]
+    three = qsgm(*start, *centers, *toy_paths)
+    assert_refused(three, 2, "--center", "2 points for 3 frames: expected one, or one for every")
+
+
+def test_things_to_tell_it_apart_from_are_frames_or_tuned_objects(
+    qsgm: Run, toy_paths: list[Path], bundle_folder: Path, tmp_path: Path
+) -> None:
+    start = ("finetune", "--json", "--epochs", 0, "--bundle", bundle_folder, "-o")
+    first, *_, other = toy_paths
+    assert qsgm(*start, tmp_path / "other", other).code == 0
+    named = ("--not", other, "--not", tmp_path / "other")
+    assert qsgm(*start, tmp_path / "o", *named, first).json["others"] == 2
+    made = json.loads((tmp_path / "o" / "object.json").read_text())["made"]
+    assert len(set(made["others_sha256"])) == 1
+    missing = qsgm(*start, tmp_path / "p", "--not", tmp_path / "nowhere.png", first)
+    assert_refused(missing, 1, "nowhere.png")
+    assert_refused(qsgm(*start, tmp_path / "p", "--not", bundle_folder, first), 1, "object.json")
+    assert not (tmp_path / "p").exists()
+
+
+def test_the_objects_size_is_measured_unless_it_is_said(
+    qsgm: Run, toy_paths: list[Path], bundle_folder: Path, tmp_path: Path
+) -> None:
+    start = ("finetune", "--json", "--epochs", 0, "--bundle", bundle_folder, "-o", tmp_path / "o")
+    measured = qsgm(*start, toy_paths[0]).json
+    assert measured["span_px"] == pytest.approx(90, abs=5)
+    said = qsgm(*start, "--span", 150, toy_paths[0]).json
+    assert (said["span_px"], said["scale"]) == (150.0, pytest.approx(0.6))
+    assert_refused(qsgm(*start, "--span", 450, toy_paths[0]), 1, "spans about 450 px", "--span")
+    assert_refused(qsgm(*start, "--span", 0, toy_paths[0]), 2, "--span")
+
+
+def test_all_instances_are_listed_in_json_in_a_table_and_in_the_picture(
+    qsgm: Run, toy_paths: list[Path], own_bundle: Path, tmp_path: Path
+) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps(manifest | {"decision": by_correlation(-10).to_json()}))
+    outcome = qsgm(
+        "finetune", "--json", "--epochs", 0, "--bundle", own_bundle, "-o", tmp_path / "o",
+        toy_paths[0],
+    )  # fmt: skip
+    assert outcome.code == 0
+    common = ("predict", "--object", tmp_path / "o", "--all", toy_paths[0])
+    values = qsgm(*common, "--json", "-o", tmp_path / "all.png").json
+    assert len(values["objects"]) > 1
+    for one in values["objects"]:
+        assert set(one) == {
+            "quality", "center_px", "displacement_px", "angle_deg", "full_angle_deg",
+            "full_angle_confidence", "refined_by",
+        }  # fmt: skip
+    assert cv2.imread(str(tmp_path / "all.png")) is not None
+    assert f"o: {len(values['objects'])} found" in qsgm(*common).out.replace("toy:", "o:")
+    path.write_text(json.dumps(manifest | {"decision": {}}))
+    spoilt = qsgm("finetune", "--bundle", own_bundle, toy_paths[0])
+    assert_refused(spoilt, 1, "the decision weighs other evidence")
 
 
 def test_blocks_say_how_many_layers_to_tune(
@@ -599,13 +702,15 @@ def test_defaults_of_the_command_line_are_those_of_the_library(
 ) -> None:
     seen = []
 
-    def stop(_: Path, __: object, settings: object) -> None:
-        seen.append(settings)
+    def stop(
+        frames: list[Path], centers: object, others: object, _: object, settings: object
+    ) -> None:
+        seen.append((frames, centers, others, settings))
         raise QsgmError("enough")
 
     monkeypatch.setattr(commands, "_finetune", stop)
     qsgm("finetune", "--bundle", bundle_folder, frame_path)
-    assert seen == [Settings()]
+    assert seen == [([frame_path], [None], (), Settings())]
 
 
 def test_an_overlay_without_a_name_is_refused(qsgm: Run, taught: Path, frame_path: Path) -> None:

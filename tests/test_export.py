@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,16 @@ import onnx
 import pytest
 import torch
 from rich.console import Console
+from toys import by_correlation
 
 from qsgm import QsgmError
 from qsgm.blocks import parse_blocks, single_layers
-from qsgm.bundle import Bundle, Recipe, load_bundle
+from qsgm.bundle import NETWORK, Bundle, Recipe, load_bundle
 from qsgm.train import calibration_runs, export
 from qsgm.train.calibration_set import CalibrationSet
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.draw_calibration import draw_calibration_set
+from qsgm.train.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.export import fold_and_quantize
 from qsgm.train.export_report import ExportReport
 from qsgm.train.fold import fold_net
@@ -108,14 +111,31 @@ def bundle(report: ExportReport) -> Bundle:
 
 
 def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
-    assert set(bundle.manifest["files"]) == {*GRAPHS, "weights.bin"}
+    data = {"weights.bin", "distractors.png"}
+    assert set(bundle.manifest["files"]) == GRAPHS | data
     others = {"manifest.json", "README.md", "SHA256SUMS"}
-    assert {path.name for path in bundle.folder.iterdir()} == {*GRAPHS, "weights.bin"} | others
+    assert {path.name for path in bundle.folder.iterdir()} == GRAPHS | data | others
     for name in GRAPHS:
         entry = bundle.manifest["files"][name]
         assert entry["bytes"] == (bundle.folder / name).stat().st_size
         assert ("peak_activation_bytes" in entry) == name.startswith("step")
         onnx.checker.check_model(onnx.load(bundle.folder / name), full_check=True)
+
+
+def test_the_bundle_brings_the_things_that_ship(bundle: Bundle) -> None:
+    things = bundle.distractors()
+    assert things is not None
+    assert (len(things), things.named) == (24, 0)
+    assert (bundle.folder / "distractors.png").read_bytes() == distractor_file(SHEET_SEED)
+
+
+def test_the_checkpoints_decision_goes_into_the_manifest(workplace: Workplace) -> None:
+    trainee = calibration_runs.prepare(workplace.checkpoint)
+    files = {NETWORK: (workplace.folder / "first" / NETWORK).read_bytes()}
+    assert "decision" not in export.describe(trainee, [], files)
+    decided = replace(trainee, checkpoint=replace(trainee.checkpoint, decision=by_correlation()))
+    described = export.describe(decided, [], files)
+    assert described["decision"] == by_correlation().to_json()
 
 
 def test_the_manifest_says_what_memory_steps_take(bundle: Bundle) -> None:
@@ -194,7 +214,8 @@ def test_the_report_has_its_keys(workplace: Workplace, report: ExportReport) -> 
     assert values["bytes"]["float"] == 2 * 4 * (160 + 54 + 112)
     assert values["bytes"]["int8"] == 2 * (2 * (152 + 48 + 96) + 8 * (8 + 6 + 16) + 8 * 19 + 5)
     sizes = [
-        (workplace.folder / "first" / name).stat().st_size for name in {*GRAPHS, "weights.bin"}
+        (workplace.folder / "first" / name).stat().st_size
+        for name in {*GRAPHS, "weights.bin", "distractors.png"}
     ]
     assert values["bundle_bytes"] == sum(sizes)
 

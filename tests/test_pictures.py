@@ -1,10 +1,12 @@
 """Pictures: large enough, drawn where the numbers say, quiet where nothing was found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm.pictures import draw_detection
+from qsgm.pictures import _values, draw_detection
 from qsgm.predict import Detection
 
 FRAME = np.full((480, 640, 3), 128, dtype=np.uint8)
@@ -74,6 +76,44 @@ def test_when_nothing_was_found_the_frame_is_dimmed_and_has_no_gripper() -> None
     assert (picture[:300] < 100).all()
     assert not is_white(picture, 200 + 38, 300 + 10)
     assert not is_white(picture, 200, 300)
+
+
+def test_an_arrow_says_where_the_right_hand_side_is_where_that_is_known() -> None:
+    plain = drawn(angle_deg=0)
+    right, left = (
+        draw_detection(FRAME, NOTHING, replace(detection(), full_angle_deg=turn), "mug")
+        for turn in (0.0, 180.0)
+    )
+    tip = 62 - 8
+    assert not is_white(plain, 200 + tip, 300 + 5)
+    assert is_white(right, 200 + tip, 300 + 5)
+    assert not is_white(right, 200 - tip, 300 + 5)
+    assert is_white(left, 200 - tip, 300 + 5)
+    assert not is_white(left, 200 + tip, 300 + 5)
+
+
+def test_every_instance_has_its_gripper() -> None:
+    other = replace(detection(angle_deg=90), center_px=(480.0, 150.0))
+    both = draw_detection(FRAME, NOTHING, detection(), "mug", [detection(), other])
+    assert is_white(both, 200 + 38, 300 + 10)
+    assert is_white(both, 480 + 10, 150 - 38)
+    assert not is_white(drawn(), 480 + 10, 150 - 38)
+
+
+def test_what_was_scaled_is_drawn_as_large_as_the_object() -> None:
+    frame = np.full((960, 1280, 3), 128, dtype=np.uint8)
+    large = replace(detection(), scale=0.5, center_px=(400.0, 600.0))
+    heatmap = NOTHING.copy()
+    heatmap[0, 2, 28] = 0.9  # looks at pixel (512, 96) of the frame at half its size
+    picture = draw_detection(frame, heatmap, large, "mug")
+    assert (picture[600 + 20, 400 + 76] > 240).all()
+    blue, _, red = picture[192, 1024].astype(int)
+    assert red > blue + 40
+
+
+def test_the_caption_gives_the_full_turn_where_it_is_known() -> None:
+    found = replace(detection(angle_deg=-30), full_angle_deg=150.04)
+    assert ("turn (counter-clockwise)", "+150.0 deg") in _values(found)
 
 
 def test_the_verdict_has_its_own_colour() -> None:

@@ -10,6 +10,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from rich.console import Console
+from toys import by_correlation
 
 from qsgm import QsgmError, Settings, finetune, load_bundle
 from qsgm.bench.speed import measure_speed
@@ -51,6 +52,20 @@ def test_tuning_with_it_gives_the_same_bits(
         whole.fidelity,
     )
     assert own.network() == whole.network()
+
+
+def test_things_and_decision_stay(bundle: Bundle, slim: Bundle, tmp_path: Path) -> None:
+    name = "distractors.png"
+    assert (slim.folder / name).read_bytes() == (bundle.folder / name).read_bytes()
+    manifest = bundle.manifest | {"decision": by_correlation().to_json()}
+    slim_bundle(replace(bundle, manifest=manifest), parse_blocks("5,6"), tmp_path / "two")
+    decision = load_bundle(tmp_path / "two").decision()
+    assert decision is not None
+    assert decision.to_json() == by_correlation().to_json()
+    files = {k: v for k, v in bundle.manifest["files"].items() if k != name}
+    old = replace(bundle, manifest=bundle.manifest | {"files": files})
+    slim_bundle(old, parse_blocks("5,6"), tmp_path / "old")
+    assert load_bundle(tmp_path / "old").distractors() is None
 
 
 @pytest.mark.parametrize(

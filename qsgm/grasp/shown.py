@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from qsgm.crops import check_center
 from qsgm.grasp.judge import Appearance, best_fit
 from qsgm.grasp.measuring import (
     LARGEST_SPAN_PX,
@@ -68,8 +69,10 @@ def shown(demonstrations: Sequence[Demonstration], span_px: float | None = None)
         span_px: the object's long side in the first frame; None: it is measured.
 
     Raises:
-        QsgmError: the object fills its frame.
+        QsgmError: the object fills its frame, or its centre is not in it.
     """
+    for one in demonstrations:
+        check_center(one.frame.shape[:2], one.center_px, margin_px=0)  # scaled, it may be inside
     first, *others = demonstrations
     measured = measured_span(first.frame, first.center_px) if span_px is None else span_px
     scale = scale_for(measured, first.frame.shape[:2])
