@@ -224,27 +224,55 @@ def test_all_products_become_integer_operators_and_no_float_product_is_left(
 
 @DEPTHS
 @KERNELS
-@pytest.mark.parametrize(("bits", "least_sqnr_db"), [(8, 36), (16, 55)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("bits", "least_sqnr_db"), [(8, 38), (16, 55)])
 def test_int8_stays_close_to_float_whatever_the_channels_scales(
-    seed: int,
     bits: ActivationBits,
     least_sqnr_db: float,
     hidden: tuple[int, ...],
     kernel: int,
     side: int,
 ) -> None:
+    # On average: of one random SGM the gradient is a small difference of large terms, of another
+    # it is not, and the ratio of one is 10 dB from another's (a standard deviation of 1 to 2.7).
+    ratios = [
+        sqnr_db_with_a_loud_channel(1e4, seed, bits, hidden, kernel, side) for seed in range(25)
+    ]
+    assert np.mean(ratios) > least_sqnr_db
+
+
+@BITS
+@DEPTHS
+@KERNELS
+@pytest.mark.parametrize("seed", range(3))
+def test_how_loud_a_channel_is_costs_the_others_nothing(
+    seed: int, bits: ActivationBits, hidden: tuple[int, ...], kernel: int, side: int
+) -> None:
+    # Both times it is the loudest: what the typical channel is, does not change.
+    loud, louder = (
+        sqnr_db_with_a_loud_channel(loudness, seed, bits, hidden, kernel, side)
+        for loudness in (1e2, 1e4)
+    )
+    assert louder == pytest.approx(loud, abs=0.1)
+
+
+def sqnr_db_with_a_loud_channel(
+    loudness: float,
+    seed: int,
+    bits: ActivationBits,
+    hidden: tuple[int, ...],
+    kernel: int,
+    side: int,
+) -> float:
+    """Of a random SGM, one of whose channels is so many times louder and weighs as much less."""
     rng = np.random.default_rng(seed)
     sgm = random_sgm(rng, 16, *hidden, kernel=kernel)
-    inputs = random_inputs(rng, sgm, 2000 // side**2, side**2)
-    inputs[:, :, 0] *= 1e4  # one loud channel must not cost the quiet ones anything
-    sgm.convs[0].weight[:, 0] *= 1e-4
+    inputs = random_inputs(rng, sgm, 600 // side**2, side**2)
+    inputs[:, :, 0] *= loudness
+    sgm.convs[0].weight[:, 0] /= loudness
     gradient, clipped = integer_forward(quantize_sgm(sgm, seen_ranges(sgm, inputs), bits), inputs)
-    exact = float_gradient(sgm, inputs)
-    noise = gradient - exact
-    sqnr_db = 10 * np.log10(np.square(exact).sum() / np.square(noise).sum())
-    assert sqnr_db > least_sqnr_db
     assert clipped == 0
+    exact = float_gradient(sgm, inputs)
+    return float(10 * np.log10(np.square(exact).sum() / np.square(gradient - exact).sum()))
 
 
 @DEPTHS
