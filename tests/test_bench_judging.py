@@ -428,3 +428,15 @@ def test_a_methods_threshold_is_its_own() -> None:
     level = MethodResults("mine", tuple(results)).at_false_alarm_rate()
     assert level.threshold == 0.7
     assert [r.outcome for r in level.results] == ["right_place", "quiet"] * 2
+
+
+def test_examples_show_other_subjects_in_every_column_and_the_last_without_the_object() -> None:
+    album = Album(tuple("abcdefgh"))
+    scene = Scene(np.zeros((480, 640, 3), np.uint8), HERE, condition="beside")
+    for frame in album.subjects:
+        for number, center in ((0, HERE), (0, None), (1, HERE), (1, None)):
+            told = replace(truth(center, number), frame=frame)
+            marked = replace(scene, frame=np.full((480, 640, 3), ord(frame), np.uint8))
+            album.look(marked, judge(told, answer(found=False), NOTHING))
+    kept = album.examples["beside"]
+    assert [chr(int(np.median(kept[k]))) for k in range(4)] == ["a", "c", "e", "g"]

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.bench.composing import Scene
+from qsgm.bench.composing import CONDITIONS, Scene
 from qsgm.bench.judging import Judged, Outcome, Spot
 
 Picture = NDArray[np.uint8]
@@ -52,17 +52,18 @@ class Album:
     """Keeps a few scenes with their answers drawn: examples, and ways to go wrong."""
 
     subjects: tuple[str, ...]  # names of those that are taught, in their order
-    examples: dict[str, list[Picture]] = field(default_factory=dict)
+    examples: dict[str, dict[int, Picture]] = field(default_factory=dict)  # of each column
     failures: dict[str, Picture] = field(default_factory=dict)
     _kept: dict[tuple[str, Outcome], int] = field(default_factory=dict)
 
     def look(self, scene: Scene, judged: Judged) -> None:
         """Keep a scene if it is one of the examples, or among the first to go wrong this way."""
         truth, outcome = judged.truth, judged.outcome
-        if self._is_example(judged):
+        column = self._column(judged)
+        if column is not None:
             drawn = annotated(scene, judged, thickness=4)
             small = cv2.resize(drawn, _doubled(_THUMB), interpolation=cv2.INTER_AREA)
-            self.examples.setdefault(truth.condition, []).append(np.asarray(small, np.uint8))
+            self.examples.setdefault(truth.condition, {})[column] = np.asarray(small, np.uint8)
         key = truth.condition, outcome
         if outcome in ("right_place", "quiet") or self._kept.get(key, 0) == PICTURES_OF_EACH:
             return
@@ -70,18 +71,18 @@ class Album:
         name = f"{truth.condition}_{outcome}_{truth.frame}_{truth.number}"
         self.failures[name] = annotated(scene, judged, thickness=2)
 
-    def _is_example(self, judged: Judged) -> bool:
-        """Each example shows another subject, and another one in every condition."""
-        truth = judged.truth
-        shown = len(self.examples.get(truth.condition, ()))
-        if shown == EXAMPLES or truth.number:
-            return False
-        if truth.present == (shown == EXAMPLES - 1):
-            return False
-        if not truth.present and not truth.absent_thing and truth.frame != self.subjects[-1]:
-            return False
-        first = (shown * len(self.subjects)) // EXAMPLES
-        return self.subjects.index(truth.frame) >= first
+    def _column(self, judged: Judged) -> int | None:
+        """Where a scene is an example; every column and condition shows other subjects."""
+        truth, count = judged.truth, len(self.subjects)
+        shift = CONDITIONS.index(truth.condition) % max(count // EXAMPLES, 1)
+        shown = [(k * count) // EXAMPLES + shift for k in range(EXAMPLES)]
+        taken = self.examples.get(truth.condition, {})
+        last = EXAMPLES - 1
+        if truth.present:
+            free = (k for k in range(last) if k not in taken)
+            return next((k for k in free if self.subjects[shown[k]] == truth.frame), None)
+        fits = self.subjects[shown[last]] == truth.frame
+        return last if fits and (truth.absent_thing or last not in taken) else None
 
 
 def annotated(scene: Scene, judged: Judged, thickness: int) -> Picture:
@@ -114,7 +115,7 @@ def draw_scenes(values: dict[str, Any], album: Album) -> Picture:
         top = _TOP + k * _ROW
         _rule(page, top, _FAINT if k == len(rows) - 1 else _RULE)
         _row(page, name.replace("_", " "), row, top, bold=k == len(rows) - 1)
-        for i, thumb in enumerate(album.examples.get(name, ())):
+        for i, thumb in album.examples.get(name, {}).items():
             _paste(page, thumb, _THUMB_X + i * _THUMB_STEP, top + (_ROW - _THUMB[1]) // 2)
     _legend(page, height - 26)
     small = cv2.resize(page, (_WIDTH, height), interpolation=cv2.INTER_AREA)
