@@ -126,7 +126,8 @@ def _head(page: Picture, values: dict[str, Any]) -> None:
     how = "backpropagation" if values["method"] == "bp" else f"{values['precision']} SGMs"
     title = f"Taught on one frame of each of {values['objects']} objects, looked for in scenes"
     _text(page, title, (_LABEL_X, 42), 0.78, _INK, bold=True)
-    _text(page, f"last {values['layers']} layers, {how}", (_LABEL_X, 68), 0.5, _FAINT)
+    line = f"last {values['layers']} layers, {how}, {values['epochs']} epochs"
+    _text(page, line if values["epochs"] else "untouched", (_LABEL_X, 68), 0.5, _FAINT)
     _text(page, f"found in its right place, {values['scenes']} scenes", (_BAR_X, 106), 0.5, _INK)
     _text(page, "found though absent", (_ALARM_X, 106), 0.5, _INK)
     _text(page, "examples", (_THUMB_X, 106), 0.5, _INK)
