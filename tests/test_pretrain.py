@@ -29,7 +29,7 @@ TINY = PretrainConfig(
     hidden=(8,),
     tasks=2,
     crops_per_task=50,
-    backbone=BackboneConfig(steps=4, episodes_per_batch=2, crops_per_episode=8, loader_processes=0),
+    backbone=BackboneConfig(steps=4, frames_per_batch=2, crops_per_frame=8, loader_processes=0),
     matching=MatchingConfig(epochs=1, record_every=1, fit_steps=4, fit_batch=16),
     maml=MamlConfig(outer_steps=2, tasks_per_step=2, unroll=2, warm_up=1),
     early=EarlyConfig(

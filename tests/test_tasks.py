@@ -14,7 +14,7 @@ from qsgm.train.local import true_gradients
 from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
 from qsgm.train.sgm import Sgm
 from qsgm.train.start import folded_start
-from qsgm.train.tasks import EpisodeStream, TaskSet, axis_offset, draw_tasks, start_states
+from qsgm.train.tasks import CropStream, TaskSet, axis_offset, draw_tasks, start_states
 
 
 def raw_for(angle_rad: np.ndarray, quality: np.ndarray) -> torch.Tensor:
@@ -31,22 +31,21 @@ def test_the_offset_is_how_the_network_sees_the_demonstration_turned(offset: flo
 
 
 def test_a_drawn_batch_depends_on_its_number_and_seed_only() -> None:
-    crops, *parts = EpisodeStream(5, 10, 6, "double")[3]
-    again, *parts_again = EpisodeStream(5, 10, 6, "double")[3]
-    other, *_ = EpisodeStream(6, 10, 6, "double")[3]
+    crops, labels = CropStream(5, 10, 6, "double")[3]
+    again, labels_again = CropStream(5, 10, 6, "double")[3]
+    other, _ = CropStream(6, 10, 6, "double")[3]
     assert torch.equal(crops, again)
-    for part, part_again in zip(parts, parts_again, strict=True):
-        assert torch.equal(part, part_again)
+    assert torch.equal(labels, labels_again)
     assert not torch.equal(crops, other)
     assert crops.shape == (6, 128, 128, 3)
 
 
 @pytest.mark.parametrize("encoding", ["double", "paper"])
 def test_the_backbone_is_taught_angles_as_its_loss_encodes_them(encoding: AngleEncoding) -> None:
-    config = BackboneConfig(steps=3, episodes_per_batch=4, crops_per_episode=6, loader_processes=0)
+    config = BackboneConfig(steps=3, frames_per_batch=4, crops_per_frame=6, loader_processes=0)
     training = BackboneTraining(config, Loss(encoding), 5, "cpu")
-    (_, labels, *_), *_ = training._batches()
-    drawn_with = {name: EpisodeStream(5, 12, 6, name)[0][1] for name in ("double", "paper")}
+    (_, labels), *_ = training._batches()
+    drawn_with = {name: CropStream(5, 12, 6, name)[0][1] for name in ("double", "paper")}
     assert not torch.equal(drawn_with["double"], drawn_with["paper"])
     assert torch.equal(labels[0], drawn_with[encoding])
     # The paper's angles lie in the right half-plane, doubled ones everywhere.

@@ -40,7 +40,7 @@ class DecisionConfig:
     hidden: int = 16
     steps: int = 1500
     peak_rate: float = 1e-2
-    weight_decay: float = 3e-2
+    weight_decay: float = 0.3
     folds: int = 4  # the threshold is set on scenes whose episodes had no say in the weights
 
 

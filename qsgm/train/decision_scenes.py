@@ -26,7 +26,7 @@ from qsgm.train.graspnet import (
     normalize,
 )
 from qsgm.train.local import LayerState
-from qsgm.train.tasks import Task, TaskSet, make_task
+from qsgm.train.tasks import Task, TaskSet, make_task, shipped_things
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,15 @@ def _task(
 ) -> Task:
     rng = np.random.default_rng(seed)
     frame = episode.demonstration.image
-    return make_task(net, frame, rng, last_frozen=LAYERS - tuned, count=config.crops, loss=loss)
+    return make_task(
+        net,
+        frame,
+        rng,
+        last_frozen=LAYERS - tuned,
+        count=config.crops,
+        loss=loss,
+        things=shipped_things(),
+    )
 
 
 def _judge_all(

@@ -6,13 +6,12 @@ Here everything else changes: the table, the light, the distance, a slant, and w
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import HALF_CROP_PX, CropPlan, cut_crops, plan_crops
+from qsgm.crops import HALF_CROP_PX
 from qsgm.train.drawing.noise import mean_colour
 from qsgm.train.drawing.scenes import DrawnObject, DrawnScene, View, draw_object, draw_scene
 from qsgm.train.drawing.structures import STRUCTURE_KINDS
@@ -26,8 +25,6 @@ OTHERS = 96
 # An object keeps this much beyond its window from the border.
 _BORDER_PX = HALF_CROP_PX + 16
 _LARGEST_TILT_RAD = np.deg2rad(25)
-# Of the negatives that a scene gives, so many are windows on other things.
-_ON_OTHERS_SHARE = 0.5
 
 Image = NDArray[np.uint8]
 
@@ -45,9 +42,7 @@ class Difficulty:
     blurred: float
 
 
-# To learn from: everything at once.
-HARD = Difficulty((0, 1, 2, 3, 4), (0.6, 0.3, 0.1), 0.3, 0.4, 0.3, 0.25, 0.2)
-# To decide on, as scenes come: mostly one thing at a time.
+# As scenes come: mostly one thing at a time.
 USUAL = Difficulty((0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.15, 0.15, 0.12, 0.1)
 
 
@@ -65,7 +60,7 @@ class EpisodeMaker:
     """Draws episodes from one seed; tables and other things are drawn once and used again."""
 
     def __init__(
-        self, seed: int, difficulty: Difficulty = HARD, tables: int = TABLES, others: int = OTHERS
+        self, seed: int, difficulty: Difficulty = USUAL, tables: int = TABLES, others: int = OTHERS
     ) -> None:
         self.seed, self.difficulty = seed, difficulty
         self._tables = [_table((seed, 1, i)) for i in range(tables)]
@@ -132,43 +127,6 @@ class EpisodeMaker:
             other = self._others[rng.integers(len(self._others))]
             if other.kind != taught.kind:
                 return other
-
-
-@lru_cache(maxsize=2)
-def episode_maker(seed: int) -> EpisodeMaker:
-    """The maker of a seed, kept while one process goes on using it."""
-    return EpisodeMaker(seed)
-
-
-def scene_crops(
-    scene: DrawnScene, demonstration: DrawnScene, rng: np.random.Generator, count: int
-) -> tuple[Image, CropPlan]:
-    """Crops (N, 128, 128, 3) of a scene, half of them on the object, and how they were cut.
-
-    The plan's turn is that since the demonstration. Half of the negatives are windows on the middle
-    of other things, where there are any.
-    """
-    if scene.center_px is None:
-        raise ValueError("the object is not in the scene")
-    plan = plan_crops(FRAME_HW, scene.center_px, rng, count)
-    middles = _middles(scene.others, scene.center_px)
-    centers = plan.center_px.copy()
-    if len(middles):
-        moved = (plan.quality == 0) & (rng.random(count) < _ON_OTHERS_SHARE)
-        spots = middles[rng.integers(0, len(middles), count)] + rng.uniform(-6, 6, (count, 2))
-        centers[moved] = spots[moved]
-    cut = CropPlan(centers, plan.turn_rad, plan.color, plan.quality)
-    turned = cut.turn_rad + np.float32(scene.turn_rad - demonstration.turn_rad)
-    return cut_crops(scene.image, cut), CropPlan(centers, turned, plan.color, plan.quality)
-
-
-def _middles(others: NDArray[np.bool_], center_px: tuple[float, float]) -> NDArray[np.float32]:
-    """Centres (K, 2) [px] of other things' visible parts, none of them on the object."""
-    _, _, stats, centers = cv2.connectedComponentsWithStats(others.astype(np.uint8))
-    large = stats[1:, cv2.CC_STAT_AREA] > 100
-    points = centers[1:][large].astype(np.float32).reshape(-1, 2)
-    apart = np.hypot(points[:, 0] - center_px[0], points[:, 1] - center_px[1]) > 28
-    return np.asarray(points[apart], dtype=np.float32)
 
 
 def _as_photographed(scene: DrawnScene, rng: np.random.Generator, how: Difficulty) -> DrawnScene:

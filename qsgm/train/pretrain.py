@@ -1,6 +1,6 @@
 """`qsgm pretrain`: from nothing to `sgm.pt`, in six stages, resumable.
 
-1. backbone: GraspNet learns drawn objects, and to tell them apart, by backpropagation.
+1. backbone: GraspNet learns drawn objects by backpropagation.
 2. matching: the SGMs behind layers 4 and 5 regress true gradients.
 3. meta: MAML with these SGMs as the update rule, three layers tuned.
 4. early: the SGMs behind layers 1 to 3 regress true gradients.
