@@ -9,10 +9,11 @@ matrix products.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import radians
+from math import cos, radians, sin
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from qsgm.grasp.patch import PATCH_PX, Patch, mirrored_square
@@ -33,7 +34,7 @@ _COARSE_REACH = 3  # px of the level
 _MIDDLE_TURNS = (-radians(5), 0.0, radians(5))
 _MIDDLE_SCALES, _MIDDLE_REACH = (0.93, 1.0, 1.07), 2
 _FINE_TURNS = (-radians(2.5), 0.0, radians(2.5))
-_FINE_SCALES, _FINE_REACH = (0.97, 1.0, 1.03), 2
+_FINE_SCALES, _FINE_REACH = (0.97, 1.0, 1.03), 1
 # Turns that differ by less are the same hypothesis.
 _SAME_TURN = np.deg2rad(25)
 _STARTS = 3
@@ -134,9 +135,8 @@ def middle_fit(template: Template, scene: Pyramid, start: Fit) -> Fit:
 
 
 def refine_fit(template: Template, scene: Pyramid, fit: Fit) -> Fit:
-    """The same fit at half of the resolution, between pixels and between turns."""
-    fine = _refined(template, scene, FINE, fit, _FINE_TURNS, _FINE_SCALES, _FINE_REACH)
-    return _between(template, scene, fine)
+    """The same fit at half of the resolution, to be aligned from there."""
+    return _refined(template, scene, FINE, fit, _FINE_TURNS, _FINE_SCALES, _FINE_REACH)
 
 
 def _refined(
@@ -152,25 +152,6 @@ def _refined(
     scores, places = _scores(template, scene, level, poses, start.center_px, reach)
     place, pose = np.unravel_index(int(scores.argmax()), scores.shape)
     return Fit(float(scores[place, pose]), *poses[pose], tuple(places[place]))
-
-
-def _between(template: Template, scene: Pyramid, fit: Fit) -> Fit:
-    """Move to the top of the parabolas through the scores beside the best place and turn."""
-    step = 1 << FINE
-    poses = [(fit.turn_rad + turn, fit.scale) for turn in _FINE_TURNS]
-    scores, places = _scores(template, scene, FINE, poses, fit.center_px, 1)
-    around = scores.reshape(3, 3, 3)  # rows, columns, turns
-    x = places[4][0] + step * _peak_offset(around[1, :, 1])
-    y = places[4][1] + step * _peak_offset(around[:, 1, 1])
-    turn = fit.turn_rad + _FINE_TURNS[2] * _peak_offset(around[1, 1, :])
-    return Fit(max(fit.score, float(around[1, 1, 1])), turn, fit.scale, (float(x), float(y)))
-
-
-def _peak_offset(three: NDArray[np.floating]) -> float:
-    """Where between -1 and 1 the parabola through three values has its top."""
-    before, here, after = (float(value) for value in three)
-    bend = before - 2 * here + after
-    return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -1, 1))
 
 
 def _distinct(scores: Floats, places: Floats, poses: Sequence[tuple[float, float]]) -> list[Fit]:
@@ -228,15 +209,15 @@ def windows_around(
     image = scene.levels[level]
     left, top = (round((value + 0.5) / step - side / 2) - reach for value in center_px)
     region = mirrored_square(image, left, top, side + 2 * reach)
-    at = np.arange(2 * reach + 1)
     channels = np.ascontiguousarray(region.transpose(2, 0, 1))
-    windows = np.empty((len(at), len(at), 3, side, side), np.float32)
-    for down in at:
-        for right in at:
-            windows[down, right] = channels[:, down : down + side, right : right + side]
-    x, y = (step * (first + at + side / 2) - 0.5 for first in (left, top))
-    places = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
-    return windows.reshape(-1, 3, side * side), places.astype(np.float32)
+    views = sliding_window_view(channels, (side, side), (1, 2))  # (3, rows, columns, side, side)
+    windows = views.transpose(1, 2, 0, 3, 4).reshape(-1, 3, side * side)
+    at = np.arange(2 * reach + 1)
+    places = np.empty((len(at), len(at), 2), np.float32)
+    for axis, first in enumerate((left, top)):
+        along = step * (first + at + side / 2) - 0.5
+        places[..., axis] = along if axis == 0 else along[:, None]
+    return windows, places.reshape(-1, 2)
 
 
 def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
@@ -261,10 +242,9 @@ def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) 
 
 def _motion(patch_px: int, side: int, turn: float, scale: float) -> NDArray[np.float64]:
     """Map (2, 3) from a window's pixels to those of a patch that is turned and scaled in it."""
-    cos, sin = np.cos(turn) / scale, np.sin(turn) / scale
-    inverse = np.array([[cos, -sin], [sin, cos]])
-    shift = (patch_px - 1) / 2 - inverse @ np.full(2, (side - 1) / 2)
-    return np.concatenate([inverse, shift[:, None]], axis=1)
+    c, s = cos(turn) / scale, sin(turn) / scale
+    inner, outer = (side - 1) / 2, (patch_px - 1) / 2
+    return np.array([[c, -s, outer - (c - s) * inner], [s, c, outer - (c + s) * inner]])
 
 
 def _wrapped(angle: float) -> float:
