@@ -337,7 +337,8 @@ def detection_table(detection: Detection, name: str) -> RenderableType:
     table.add_row("quality", f"{detection.quality:.2f}")
     table.add_row("centre", f"{x:.1f}, {y:.1f} px")
     table.add_row("move", f"{right:+.1f} px right, {down:+.1f} px down")
-    table.add_row("turn", turn_text(detection))
+    modulo = "" if detection.full_angle_deg is not None else ", or the opposite"
+    table.add_row("turn", f"{turn_text(detection)} counter-clockwise{modulo}")
     return table
 
 
@@ -346,22 +347,22 @@ def instances_table(instances: Sequence[Detection], name: str) -> RenderableType
     if not instances:
         return Text(f"{name}: not found", style="bold red")
     table = plain_table(f"{name}: {len(instances)} found")
-    for header in ("quality", "centre", "move right, down", "turn"):
+    for header in ("quality", "centre", "move right, down", "turn", "or the opposite"):
         table.add_column(header, justify="right")
     for one in instances:
         (x, y), (right, down) = one.center_px, (value + 0.0 for value in one.displacement_px)
         move = f"{right:+.1f}, {down:+.1f} px"
-        table.add_row(f"{one.quality:.2f}", f"{x:.1f}, {y:.1f} px", move, turn_text(one))
+        both = "no" if one.full_angle_deg is not None else "yes"
+        table.add_row(f"{one.quality:.2f}", f"{x:.1f}, {y:.1f} px", move, turn_text(one), both)
     return table
 
 
 def turn_text(detection: Detection) -> str:
     """Over the full circle where that is known."""
     if detection.full_angle_deg is None:
-        turn = round_degrees(detection.angle_deg, 1)
-        return f"{turn:+.1f}° counter-clockwise, or the opposite"
+        return f"{round_degrees(detection.angle_deg, 1):+.1f}°"
     full = round(detection.full_angle_deg, 1) + 0.0
-    return f"{180.0 if full <= -180.0 else full:+.1f}° counter-clockwise"
+    return f"{180.0 if full <= -180.0 else full:+.1f}°"
 
 
 def plain_table(title: str | None) -> Table:
