@@ -120,8 +120,8 @@ def test_a_learning_curve_goes_from_the_untouched_network_to_what_finetune_gives
     for runs in accuracy_report.runs:
         alone = finetune(frame, bundle, replace(MAIN, epochs=runs.epochs, **changes))
         curve = runs.methods[name][0]
-        assert tuple(curve[0]) == astuple(alone.zero_shot)
-        assert tuple(curve[-1]) == astuple(alone.accuracy)
+        assert tuple(curve[0]) == astuple(alone.zero_shot)[:2]
+        assert tuple(curve[-1]) == astuple(alone.accuracy)[:2]
         np.testing.assert_array_equal(runs.methods["untouched"][0], curve[:1].repeat(len(curve), 0))
 
 
