@@ -20,7 +20,7 @@ from qsgm.train.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv
 from qsgm.train.graspnet import LAYERS
 from qsgm.train.local import LayerState, columns, layer_forward, local_step, loss_gradient
 from qsgm.train.maml import MOMENTUM
-from qsgm.train.tasks import Task, make_task, shipped_things, start_states
+from qsgm.train.tasks import Task, make_task, start_states
 from qsgm.tuning import BATCH, rate_factor
 from qsgm.weights import to_step_layout
 
@@ -98,7 +98,6 @@ class Trainee:
             count=plan.crops,
             loss=self.checkpoint.loss,
             center_px=demonstration.center_px,
-            things=shipped_things(),
         )
 
 
