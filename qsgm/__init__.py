@@ -24,6 +24,7 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 if TYPE_CHECKING:
     from qsgm.bundle import load_bundle
     from qsgm.finetuning import finetune
+    from qsgm.grasp.source import Demonstration
     from qsgm.images import read_frame
     from qsgm.settings import Settings
     from qsgm.tuned import load_object
@@ -31,6 +32,7 @@ else:
     # Imported when asked for, since they bring in ONNX Runtime and OpenCV. None of these modules
     # may have the name of an export: importing it would put the module in the export's place.
     _HOME = {
+        "Demonstration": "qsgm.grasp.source",
         "Settings": "qsgm.settings",
         "finetune": "qsgm.finetuning",
         "load_bundle": "qsgm.bundle",
@@ -46,6 +48,7 @@ else:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Demonstration",
     "QsgmError",
     "Settings",
     "__version__",

@@ -1,0 +1,81 @@
+"""From a heatmap to few judged candidates: the best first, none twice."""
+
+import math
+
+import numpy as np
+import pytest
+from toys import bump, lay, table, toy
+
+from qsgm.grasp.candidates import candidate_cells
+from qsgm.grasp.evidence import NAMES
+from qsgm.grasp.finding import confidence_of, full_degrees
+from qsgm.grasp.judge import JUDGED, Appearance, cell_center, judge
+from qsgm.grasp.patch import cut_patch
+
+CENTER = (320.0, 240.0)
+APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
+
+
+def test_candidates_are_local_maxima_best_first() -> None:
+    quality = np.zeros((6, 8), np.float32)
+    quality[1, 1], quality[1, 2], quality[4, 6], quality[5, 7] = 0.9, 0.8, 0.95, 0.94
+    assert candidate_cells(quality, 2) == [(4, 6), (1, 1)]
+    cells = candidate_cells(quality, 100)
+    assert len(set(cells)) == len(cells)
+    for i, (row, col) in enumerate(cells):
+        assert all(max(abs(row - r), abs(col - c)) > 1 for r, c in cells[:i])
+    assert candidate_cells(np.zeros((1, 1), np.float32), 5) == [(0, 0)]
+
+
+def test_a_cell_looks_at_the_middle_of_its_window() -> None:
+    assert cell_center((0, 0)) == (64, 64)
+    assert cell_center((2, 5)) == (64 + 16 * 5, 64 + 16 * 2)
+
+
+def test_the_object_is_judged_first_though_the_network_likes_others_better() -> None:
+    place, turn = (200.0, 180.0), 50.0
+    scene = lay(toy(), table(2), place, turn)
+    heatmap = bump([(450.0, 300.0), (500.0, 120.0)], angle_rad=math.radians(turn))
+    heatmap[0] = np.maximum(heatmap[0], 0.3 * bump([place])[0])
+    found = judge(APPEARANCE, scene, heatmap, 0.0, "double")
+    assert 1 < len(found) <= JUDGED
+    best = found[0]
+    assert math.dist(best.center_px, place) < 0.5
+    assert math.dist(best.cell_px, place) < 12
+    facts = dict(zip(NAMES, best.evidence.tolist(), strict=True))
+    assert facts["correlation"] > 0.95
+    assert facts["turn_difference"] < 0.02
+    assert facts["quality_logit"] == pytest.approx(
+        math.log(best.quality / (1 - best.quality)), abs=1e-4
+    )
+    for i, one in enumerate(found):
+        assert all(math.dist(one.fit.center_px, other.fit.center_px) > 12 for other in found[:i])
+
+
+def test_judging_again_gives_the_same_numbers() -> None:
+    heatmap = bump([(200.0, 180.0), (450.0, 300.0)])
+    scenes = [lay(toy(), table(seed), (200.0, 180.0), 50) for seed in (2, 3)]
+    first = judge(APPEARANCE, scenes[0], heatmap, 0.0, "double")
+    judge(APPEARANCE, scenes[1], heatmap, 0.0, "double")
+    again = judge(APPEARANCE, scenes[0], heatmap, 0.0, "double")
+    for one, other in zip(first, again, strict=True):
+        assert one.fit == other.fit
+        np.testing.assert_array_equal(one.evidence, other.evidence)
+
+
+def test_a_frame_of_one_window_has_one_candidate() -> None:
+    scene = lay(toy(), table(2, (128, 128)), (64.0, 64.0), 20)
+    (only,) = judge(APPEARANCE, scene, bump([(64.0, 64.0)], (128, 128)), 0.0, "double")
+    assert math.dist(only.center_px, (64, 64)) < 0.5
+
+
+def test_without_a_lead_both_ways_round_are_as_likely_and_more_of_it_is_surer() -> None:
+    assert confidence_of(0.0) == 0.5
+    assert 0.5 < confidence_of(0.05) < confidence_of(0.2) < confidence_of(1.5) <= 1
+
+
+@pytest.mark.parametrize(
+    ("turn", "degrees"), [(0, 0), (180, 180), (-180, 180), (181, -179), (540, 180), (-359, 1)]
+)
+def test_a_full_turn_is_in_half_open_degrees(turn: float, degrees: float) -> None:
+    assert full_degrees(math.radians(turn)) == pytest.approx(degrees, abs=1e-9)
