@@ -11,7 +11,8 @@ from qsgm.grasp.likeness import Likeness
 from qsgm.preparing import Accuracy
 
 LEAST_DETECTION = 0.9
-LEAST_TOLD_APART = 0.9
+# Of other things; those that the network proposes in spite of that, the patch has to refuse.
+LEAST_TOLD_APART = 0.75
 # From here on there was hardly anything left to be made better.
 NEARLY_ALL = 0.98
 LARGEST_ANGLE_DEG = 10.0
