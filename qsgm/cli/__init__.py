@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 what was given cannot be used, 2 the command was called wr
 130 interrupted.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, cast
@@ -73,4 +74,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Entry point of the installed command."""
+    # numpy's products are small here: a second thread of its own would only spin. numpy is not
+    # imported yet; a setting of the user's own stays.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:]))
