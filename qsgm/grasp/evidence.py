@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.alignment import as_taught, slopes, upright
+from qsgm.grasp.alignment import around, as_taught, means, slopes, upright
 from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, Pyramid, Template
 
 Floats = NDArray[np.float32]
@@ -91,8 +91,8 @@ def evidence(
     """
     seen = as_taught(scene, fit)
     image, mask = reference.image, reference.mask
-    mean, taught_mean = _means(seen, mask), _means(image, mask)
-    flat, taught_flat = seen - mean, image - taught_mean
+    mean, taught_mean = means(seen, mask), means(image, mask)
+    flat, taught_flat = around(seen, mean), around(image, taught_mean)
     weights = np.concatenate([mask[None], reference.parts]).reshape(1 + _PARTS, -1)
     variances, taught_variances, products = _moments(flat, taught_flat) @ weights.T
     correlations = products / np.sqrt(
@@ -103,7 +103,7 @@ def evidence(
     parts = correlations[1:][order]
     shown = reference.parts[order[-_SHOWN_PARTS:]].mean(axis=0)
     gains = np.log((mean + 8) / (taught_mean + 8))
-    ring = _means(seen, reference.ring)
+    ring = means(seen, reference.ring)
     odds = np.log(max(quality, 1e-6) / max(1 - quality, 1e-6))
     values = (
         correlations[0],
@@ -117,7 +117,7 @@ def evidence(
         parts[:2].mean(),
         np.median(parts),
         parts[-3:].mean(),
-        _correlation(seen - _means(seen, shown), image - _means(image, shown), shown),
+        _correlation(around(seen, means(seen, shown)), around(image, means(image, shown)), shown),
         _residual(flat, taught_flat, mask, variance, taught_variance),
         np.abs(ring - mean).max() / 50,
         np.log(taught_variance + NOISE_VARIANCE),
@@ -128,14 +128,11 @@ def evidence(
     return np.array(values, np.float32)
 
 
-def _means(image: Floats, weight: Floats) -> Floats:
-    return np.asarray(np.tensordot(weight, image, ((0, 1), (0, 1))), dtype=np.float32)
-
-
 def _moments(seen: Floats, taught: Floats) -> Floats:
     """Squares and product of two images (h, w, 3), summed over the channels: (3, h w)."""
     pairs = ((seen, seen), (taught, taught), (seen, taught))
-    return np.stack([np.einsum("hwc,hwc->hw", *pair).ravel() for pair in pairs])
+    ones = np.ones(seen.shape[2], np.float32)
+    return np.stack([(a * b).reshape(-1, len(ones)) @ ones for a, b in pairs])
 
 
 def _correlation(seen: Floats, taught: Floats, weight: Floats) -> float:
