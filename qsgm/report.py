@@ -131,8 +131,9 @@ def fidelity_command_json(result: "FinetuneResult", name: str) -> dict[str, Any]
     """What `qsgm fidelity` prints: the part of :func:`finetune_json` that concerns gradients."""
     keys = ("method", "precision", "layers", "epochs", "seed", "bundle", "fidelity")
     everything = finetune_json(result, name, Path())
-    wanted = {key: everything[key] for key in ("object", *keys, "trunk", "warnings")}
+    wanted = {key: everything[key] for key in ("object", *keys, "trunk")}
     return wanted | {
+        "warnings": list(result.warnings),
         "every": result.settings.probe_every,
         "fidelity_over_run": fidelity_over_run_json(result),
     }
