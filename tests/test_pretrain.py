@@ -288,7 +288,8 @@ def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path
         after_interruption = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
-    assert threads == {"backbone": 2, "tasks": 1, "matching": 1, "meta": 1, "early": 1, "rates": 1}
+    late = ("tasks", "matching", "meta", "early", "rates", "decision")
+    assert threads == {"backbone": 2} | dict.fromkeys(late, 1)
     assert (after, after_interruption) == (2, 2)
 
 
