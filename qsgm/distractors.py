@@ -121,7 +121,7 @@ def load_distractors(data: bytes) -> Distractors:
     width, height = _sheet_size(data)
     rows = _unpacked(data, height, 1 + 4 * width)
     rgba = rows[:, 1:].reshape(height, width, 4)
-    bgra = rgba[..., [2, 1, 0, 3]]
+    bgra = np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), dtype=np.uint8)
     tiles = bgra.reshape(height // TILE_PX, TILE_PX, width // TILE_PX, TILE_PX, 4)
     sprites = np.ascontiguousarray(tiles.swapaxes(1, 2).reshape(-1, TILE_PX, TILE_PX, 4))
     return Distractors(sprites, _reaches(sprites))
@@ -351,7 +351,8 @@ def _reaches(sprites: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 def _reach(sprite: Layer) -> tuple[int, int]:
     """How far (x, y) the visible pixels are from the middle of a sprite, rounded up."""
-    rows, columns = np.nonzero(sprite[..., 3])
+    visible = sprite[..., 3] > 0
+    columns, rows = (np.flatnonzero(visible.any(axis=axis)) for axis in (0, 1))
     x, y = (np.abs(2 * at - (TILE_PX - 1)).max(initial=0) for at in (columns, rows))
     return (int(x) + 1) // 2, (int(y) + 1) // 2
 

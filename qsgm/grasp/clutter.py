@@ -45,6 +45,10 @@ class Addition(IntEnum):
     EDGE = 2
 
 
+# Looked up for every crop: an enumeration takes longer to say what they are.
+_THING, _EDGE = int(Addition.THING), int(Addition.EDGE)
+
+
 @dataclass(frozen=True)
 class ClutterPlan:
     """What is put on each of N crops; rows that get nothing are planned all the same."""
@@ -106,9 +110,10 @@ def dimmed(plan: CropPlan, rng: np.random.Generator) -> CropPlan:
 
 def add_clutter(crop: NDArray[np.uint8], plan: ClutterPlan, row: int, things: Distractors) -> None:
     """Put what is planned for one row on a crop (128, 128, 3), in place."""
-    if plan.addition[row] == Addition.THING:
+    addition = int(plan.addition[row])
+    if addition == _THING:
         paste_planned(crop, things, plan.things, row)
-    elif plan.addition[row] == Addition.EDGE:
+    elif addition == _EDGE:
         paint_planned(crop, plan.edges, row)
 
 
