@@ -37,7 +37,6 @@ from qsgm.distractors import FILE as DISTRACTORS
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
 from qsgm.folded import FoldedSgm
-from qsgm.grasp.decision import Decision
 from qsgm.quantize import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.calibrate import AUTO, calibrate
 from qsgm.train.calibration_runs import EPOCHS, Trainee, prepare
@@ -316,7 +315,7 @@ def describe(
 ) -> dict[str, Any]:
     """The manifest that :mod:`qsgm.bundle` reads."""
     loss = trainee.checkpoint.loss
-    decision: Decision | None = getattr(trainee.checkpoint, "decision", None)
+    decision = trainee.checkpoint.decision
     return {
         "format": FORMAT,
         "version": VERSION,
