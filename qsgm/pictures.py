@@ -84,7 +84,7 @@ def draw_detection(
         (H', W', 3) BGR: the enlarged frame with a caption below; W' is at least 1280.
     """
     canvas = _enlarge(frame, 1 / detection.scale, dim=not detection.found)
-    _draw_heat(canvas, heatmap[0])
+    _draw_heat(canvas, heatmap[0], HALF_CROP_PX - detection.margin_px)
     for other in instances:
         if other.center_px != detection.center_px:
             _draw_window(canvas, other.center_px)
@@ -111,10 +111,13 @@ def _enlarge(frame: Picture, reach: float, *, dim: bool) -> _Canvas:
     )
 
 
-def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32]) -> None:
-    """Lay the quality (rows, cols) over the canvas where it is notable, with a line at 0.5."""
+def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32], first_px: int) -> None:
+    """Lay the quality (rows, cols) over the canvas where it is notable, with a line at 0.5.
+
+    The first cell's window has its middle `first_px` from the corner of the scaled frame.
+    """
     height, width = canvas.image.shape[:2]
-    step, first = (side * canvas.scale * canvas.reach for side in (CELL_PX, HALF_CROP_PX))
+    step, first = (side * canvas.scale * canvas.reach for side in (CELL_PX, first_px))
     cell_of_pixel = np.array([[1 / step, 0, -first / step], [0, 1 / step, -first / step]])
     smooth = cv2.warpAffine(
         np.asarray(quality, dtype=np.float32),

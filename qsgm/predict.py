@@ -58,6 +58,7 @@ class Detection:
     full_angle_confidence: float | None = None  # that it is not the opposite, in [0, 1]
     refined_by: RefinedBy = "network"  # whence centre and angle are
     scale: float = 1.0  # what the frame was scaled by for the network
+    margin_px: int = 0  # and mirrored beyond its border after that
     candidates: tuple[Place, ...] = ()  # where else it may be, best first; this one is the first
 
 

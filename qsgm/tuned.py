@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +27,7 @@ from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
 from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
 from qsgm.grasp.judge import JUDGED, cell_center
-from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame
+from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
 from qsgm.grasp.others import Other
 from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
 from qsgm.grasp.shown import View
@@ -41,6 +42,10 @@ PATCH = "patch.png"
 FOUND_FROM = 0.5
 # Without a decision the patch moves a detection only where it fits as well as that.
 STRONG_CORRELATION = 0.7
+# A frame is mirrored so far beyond its border (at the object's scale) that windows can be centred
+# on objects that lie close to it.
+MARGIN_PX = 48
+_LEAST_SIDE_PX = 64
 # Two places of the network that are closer are of the same object.
 _APART_PX = 48.0
 _COMMAND = "qsgm finetune -o DIR"
@@ -93,14 +98,14 @@ class TunedObject:
         best, *others = self._detections(seen, heatmap, JUDGED)
         best = self._refined(best, seen)
         places = tuple(_as_place(one) for one in (best, *others))
-        return self._in_frame(replace(best, candidates=places), seen, frame), heatmap
+        return self._in_frame(replace(best, candidates=places), frame), heatmap
 
     def locate_all(self, frame: NDArray[np.uint8]) -> list[Detection]:
         """Every instance of the object in a frame (H, W, 3), the surest first."""
         seen = self._seen(frame)
         found = self._detections(seen, self.heatmap(seen), MOST_INSTANCES)
         refined = [self._refined(one, seen) for one in found if one.found]
-        return [self._in_frame(one, seen, frame) for one in refined]
+        return [self._in_frame(one, frame) for one in refined]
 
     def as_other(self) -> Other:
         """What it looks like, for another object to be told apart from it.
@@ -122,23 +127,31 @@ class TunedObject:
         about = self.description
         if not about.views:
             return None
-        return Finder(about.views, about.offset_rad, about.encoding)
+        return Finder(about.views)
+
+    @property
+    def _margin_px(self) -> int:
+        """Objects of version 1 see frames as they are."""
+        return MARGIN_PX if self.description.views else 0
 
     def _seen(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The frame at the object's scale.
+        """The frame at the object's scale, mirrored beyond its border.
 
         Raises:
-            QsgmError: less than a window is left of it.
+            QsgmError: too little is left of it.
         """
-        seen = scaled_frame(frame, self.description.scale)
-        if min(seen.shape[:2]) < CROP_PX:
-            (height, width), (seen_height, seen_width) = frame.shape[:2], seen.shape[:2]
+        scaled, margin = scaled_frame(frame, self.description.scale), self._margin_px
+        least = _LEAST_SIDE_PX if margin else CROP_PX
+        if min(scaled.shape[:2]) < least:
+            (height, width), (low, narrow) = frame.shape[:2], scaled.shape[:2]
             raise QsgmError(
-                f"a frame of {width}x{height} px has {seen_width}x{seen_height} at the scale of "
-                f"{self.description.name!r}: expected at least {CROP_PX} on each side; take it as "
+                f"a frame of {width}x{height} px has {narrow}x{low} at the scale of "
+                f"{self.description.name!r}: expected at least {least} on each side; take it as "
                 "the object's demonstration was taken"
             )
-        return seen
+        how = cv2.BORDER_REFLECT_101
+        seen = cv2.copyMakeBorder(scaled, margin, margin, margin, margin, how)
+        return np.asarray(seen, dtype=np.uint8)
 
     def _detections(
         self, seen: NDArray[np.uint8], heatmap: NDArray[np.float32], count: int
@@ -182,26 +195,31 @@ class TunedObject:
         laid = self._finder.lay(seen, closer.center_px)
         return _moved(closer, laid) if laid.fit.score >= STRONG_CORRELATION else closer
 
-    def _in_frame(
-        self, place: Detection, seen: NDArray[np.uint8], frame: NDArray[np.uint8]
-    ) -> Detection:
-        """A place of the scaled frame in the frame's own pixels."""
-        seen_hw, frame_hw = seen.shape[:2], frame.shape[:2]
-        places = place.candidates
-        center = place.center_px
-        if seen_hw != frame_hw:
-            center = moved_point(center, seen_hw, frame_hw)
-            places = tuple(
-                replace(one, center_px=moved_point(one.center_px, seen_hw, frame_hw))
-                for one in places
-            )
+    def _in_frame(self, place: Detection, frame: NDArray[np.uint8]) -> Detection:
+        """A place of what the network saw in the frame's own pixels."""
+        height, width = frame.shape[:2]
+        center = self._point_in(frame, place.center_px)
+        places = (
+            replace(one, center_px=self._point_in(frame, one.center_px)) for one in place.candidates
+        )
         return replace(
             place,
             center_px=center,
-            displacement_px=(center[0] - frame_hw[1] / 2, center[1] - frame_hw[0] / 2),
+            displacement_px=(center[0] - width / 2, center[1] - height / 2),
             scale=self.description.scale,
-            candidates=places,
+            margin_px=self._margin_px,
+            candidates=tuple(places),
         )
+
+    def _point_in(
+        self, frame: NDArray[np.uint8], point_px: tuple[float, float]
+    ) -> tuple[float, float]:
+        x, y = (value - self._margin_px for value in point_px)
+        scale = self.description.scale
+        if scale == 1.0:
+            return x, y
+        scaled_hw = scaled_shape(frame.shape[:2], scale)
+        return moved_point((x, y), scaled_hw, frame.shape[:2])
 
 
 def save_object(

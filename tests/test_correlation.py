@@ -75,7 +75,7 @@ def test_the_demonstration_itself_is_found_where_and_as_it_lies() -> None:
     assert math.dist(APPEARANCE.center_of(fit), CENTER) < 0.05
     assert turn_error(fit, 0) < 0.05
     assert fit.scale == pytest.approx(1, abs=0.002)
-    assert fit.score > 0.98
+    assert fit.score > 0.8
     assert lead > 0.2
 
 
@@ -129,7 +129,7 @@ def test_a_scene_moved_back_by_its_fit_is_the_demonstration() -> None:
     fit = Fit(0, math.radians(turn), scale, center)
     taught = as_taught(pyramid_of(DEMONSTRATION), Fit(0, 0, 1.0, CENTER))
     seen = as_taught(scene, fit)
-    mask = APPEARANCE.reference.mask > 0
+    mask = APPEARANCE.reference.inside
     assert np.abs(seen - taught)[mask].mean() < 6
     wrong = as_taught(scene, Fit(0, math.radians(turn + 20), scale, center))
     assert np.abs(wrong - taught)[mask].mean() > 15

@@ -84,24 +84,27 @@ def facts_of(scene: np.ndarray, turn_deg: float = 0.0) -> dict[str, float]:
     frame = lay(toy(), table(), CENTER)
     appearance = Appearance.of(cut_patch(frame, CENTER))
     fit = Fit(0.0, np.deg2rad(turn_deg), 1.0, (319.5, 239.5))
-    values = evidence(appearance.reference, pyramid_of(scene), fit, 0.9, np.deg2rad(turn_deg), 0.3)
+    look = appearance.aligner.look(pyramid_of(scene), fit)
+    values = evidence(appearance.reference, look, fit.scale, 0.9, 0.3)
     return dict(zip(NAMES, values.tolist(), strict=True))
 
 
 def test_everything_speaks_for_the_demonstration_itself() -> None:
     facts = facts_of(lay(toy(), table(), CENTER))
-    for name in ("correlation", "joint_correlation", "edge_agreement", "agreement_low"):
-        assert facts[name] > 0.95, name
-    for name in ("gain", "tint", "spread", "scale", "residual", "turn_difference"):
-        assert abs(facts[name]) < 0.02, name
+    for name in ("correlation", "agreement_middle", "edge_agreement", "inside", "palette"):
+        assert facts[name] > 0.9, name
+    for name in ("tint", "hue", "spread", "scale", "residual", "contrast_gain", "deviation"):
+        assert abs(facts[name]) < 0.05, name
     assert facts["quality_logit"] == pytest.approx(np.log(9), abs=1e-4)
     assert facts["lead"] == pytest.approx(0.3)
 
 
-def test_half_light_is_gain_and_not_another_look() -> None:
-    facts = facts_of(lay(toy(), table(3), CENTER, light=0.5))
-    assert 0.5 < facts["gain"] < np.log(2)  # dark pixels say little: levels count from 8 below 0
-    assert facts["correlation"] > 0.8
+def test_half_light_is_contrast_and_not_another_look() -> None:
+    bright = facts_of(lay(toy(), table(3), CENTER))
+    half = facts_of(lay(toy(), table(3), CENTER, light=0.5))
+    assert half["contrast_gain"] == pytest.approx(np.log(0.5), abs=0.15)
+    assert half["correlation"] > 0.9
+    assert half["agreement_middle"] > bright["agreement_middle"] - 0.1
 
 
 def test_another_table_changes_little_and_another_object_much() -> None:
@@ -109,6 +112,25 @@ def test_another_table_changes_little_and_another_object_much() -> None:
     other = facts_of(lay(toy()[..., [1, 0, 2, 3]], table(5), CENTER))
     turned = facts_of(lay(toy(), table(5), CENTER, 90))
     assert same["correlation"] > 0.9
-    assert other["tint"] > same["tint"] + 0.3
-    assert turned["correlation"] < 0.7
+    assert same["palette"] > other["palette"] + 0.2
+    assert other["hue"] > same["hue"] + 0.1
+    assert turned["agreement_low"] < same["agreement_low"] - 0.3
     assert turned["outline"] < same["outline"]
+
+
+def test_a_thing_of_the_same_colours_that_is_larger_has_no_edge_where_the_object_ends() -> None:
+    plain = np.zeros_like(toy())
+    plain[..., :3] = (60, 70, 200)
+    plain[100:380, 20:460, 3] = 255
+    taught, wide = facts_of(lay(toy(), table(5), CENTER)), facts_of(lay(plain, table(5), CENTER))
+    assert taught["edge_low"] > np.log1p(20)
+    assert wide["edge_middle"] < np.log1p(15)
+
+
+def test_what_hides_a_part_leaves_the_other_cells_agreeing() -> None:
+    scene = lay(toy(), table(5), CENTER)
+    scene[200:280, 270:305] = (250, 250, 20)
+    hidden, shown = facts_of(scene), facts_of(lay(toy(), table(5), CENTER))
+    assert hidden["correlation"] > 0.9
+    assert hidden["agreement_middle"] > 0.6 * shown["agreement_middle"]
+    assert hidden["agreement_low"] < shown["agreement_low"] - 0.2

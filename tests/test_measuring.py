@@ -8,6 +8,7 @@ import pytest
 from toys import lay, table, toy
 
 from qsgm import QsgmError
+from qsgm.bench.subjects import drawn_subjects
 from qsgm.grasp.measuring import measured_span, moved_point, scale_for, scaled_frame
 
 
@@ -31,6 +32,21 @@ def test_a_photograph_of_many_pixels_has_its_object_measured(enlarged: float) ->
     assert measured_span(large, center) == pytest.approx(90 * enlarged, rel=0.1)
 
 
+@pytest.mark.parametrize("scale", [2.6, 3.4, 4.2])
+@pytest.mark.parametrize("frame_hw", [(480, 640), (960, 720)])
+def test_an_object_that_nearly_fills_its_frame_is_measured(
+    scale: float, frame_hw: tuple[int, int]
+) -> None:
+    assert measured_span(*shown(scale, frame_hw, 60)) == pytest.approx(90 * scale, rel=0.1)
+
+
+def test_a_table_that_looks_like_a_large_thing_is_not_taken_for_one() -> None:
+    """A spoon on a blotchy cloth: no two cuts agree, and the largest spans half of the frame."""
+    (subject,) = (one for one in drawn_subjects(5) if one.name == "cutlery_11")
+    span = measured_span(subject.frame, subject.center_px)
+    assert scale_for(span, subject.frame.shape[:2]) == 1
+
+
 def test_nothing_is_measured_where_there_is_no_object() -> None:
     assert measured_span(table(2), (320.0, 240.0)) is None
 
@@ -43,7 +59,8 @@ def test_an_object_that_fits_is_left_as_it_is(span: float | None) -> None:
 @pytest.mark.parametrize(
     ("span", "frame_hw", "scale"),
     [
-        (180.0, (480, 640), 256 / 480),  # no smaller than 256 px
+        (180.0, (480, 640), 0.5),
+        (450.0, (480, 640), 0.2),
         (180.0, (720, 1280), 0.5),
         (800.0, (3024, 4032), 90 / 800),
         (40.0, (480, 640), 2.0),
@@ -58,8 +75,8 @@ def test_others_are_scaled_until_they_do(
 
 
 def test_an_object_that_fills_its_frame_is_refused_in_one_line() -> None:
-    with pytest.raises(QsgmError, match=r"spans about 400 px of the 640x480 frame, .* step") as got:
-        scale_for(400, (480, 640))
+    with pytest.raises(QsgmError, match=r"spans about 460 px of the 640x480 frame, .* step") as got:
+        scale_for(460, (480, 640))
     assert "\n" not in str(got.value)
     assert "--span" in str(got.value)
 

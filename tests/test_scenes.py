@@ -5,7 +5,14 @@ from numpy.typing import NDArray
 
 from qsgm.angles import angle_error
 from qsgm.errors import QsgmError
-from qsgm.train.drawing.scenes import DrawnObject, DrawnScene, View, draw_object, draw_scene
+from qsgm.train.drawing.scenes import (
+    DrawnObject,
+    DrawnScene,
+    View,
+    draw_object,
+    draw_scene,
+    in_colours_of,
+)
 from qsgm.train.drawing.shapes import OBJECT_KINDS
 from qsgm.train.drawing.structures import STRUCTURE_KINDS
 
@@ -176,3 +183,15 @@ def test_an_object_throws_a_shadow() -> None:
         ring &= ~(cv2.dilate(full.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
         dark.append(float((empty.image[ring].astype(int) - full.image[ring]).mean()))
     assert np.mean(dark) > 5
+
+
+def test_a_thing_in_anothers_colours_keeps_its_shape_and_takes_the_mean_colour() -> None:
+    thing, model = an_object(3), an_object(8)
+    painted = in_colours_of(thing, model)
+    assert painted.kind == thing.kind
+    np.testing.assert_array_equal(painted.painted.coverage, thing.painted.coverage)
+    inside, wanted = (one.painted.coverage > 127 for one in (thing, model))
+    got = painted.painted.colour[inside].mean(axis=0)
+    before = thing.painted.colour[inside].mean(axis=0)
+    target = model.painted.colour[wanted].mean(axis=0)
+    assert np.abs(got - target).max() < 0.3 * np.abs(before - target).max()

@@ -75,5 +75,5 @@ def test_the_same_camera_sees_every_demonstration_at_one_scale() -> None:
 
 
 def test_what_the_user_says_of_its_size_is_not_measured() -> None:
-    assert shown([FIRST], span_px=180).scale == pytest.approx(256 / 480)
+    assert shown([FIRST], span_px=180).scale == 0.5
     assert shown([FIRST], span_px=90).scale == 1

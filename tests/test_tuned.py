@@ -16,7 +16,7 @@ from qsgm.grasp.decision import Decision
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.predict import Detection, Place, locate, refine
-from qsgm.tuned import DESCRIPTION, REPORT, ObjectDescription, TunedObject, save_object
+from qsgm.tuned import DESCRIPTION, MARGIN_PX, REPORT, ObjectDescription, TunedObject, save_object
 
 Point = tuple[float, float]
 MUG = ObjectDescription("mug", "double", 0.25)
@@ -129,7 +129,8 @@ class Told(TunedObject):
 
     def __init__(self, bundle: Bundle, description: ObjectDescription, *seen: Point) -> None:
         super().__init__(description, bundle.network_with({}), 1)
-        self.seen = [*seen]
+        margin = MARGIN_PX if description.views else 0
+        self.seen = [(x + margin, y + margin) for x, y in seen]
         self.angle_rad = 0.0
 
     def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -184,8 +185,7 @@ def test_another_thing_where_the_network_is_surest_is_not_taken_for_the_object(
     other = toy()[..., [1, 0, 2, 3]]
     other[200:280, 100:380, :3] = 255 - other[200:280, 100:380, :3]
     both = lay(other, lay(toy(), table(2), (200.0, 180.0), 20), (450.0, 300.0), 70)
-    told = Told(bundle, described(), (450.0, 300.0))
-    told.seen += [(208.0, 170.0)]
+    told = Told(bundle, described(), (450.0, 300.0), (208.0, 170.0))
     found, _ = told.locate(both)
     assert math.dist(found.center_px, (200, 180)) < 0.5
     alone, _ = told.locate(lay(other, table(2), (450.0, 300.0), 70))
@@ -270,7 +270,7 @@ def test_scenes_are_scaled_and_answered_in_their_own_pixels(bundle: Bundle) -> N
     seen = tuple((value + 0.5) * scale - 0.5 for value in center)
     told = Told(bundle, described(scale=scale), (seen[0], seen[1]))
     found, heatmap = told.locate(scene)
-    assert heatmap.shape == (3, 11, 18)
+    assert heatmap.shape == (3, 17, 24)
     assert math.dist(found.center_px, center) < 2
     assert found.displacement_px == pytest.approx((100, 100), abs=2)
     assert turn_error(found.full_angle_deg, 35) < 0.5
@@ -278,8 +278,17 @@ def test_scenes_are_scaled_and_answered_in_their_own_pixels(bundle: Bundle) -> N
     assert found.candidates[0].center_px == found.center_px
     (only,) = told.locate_all(scene)
     assert only.center_px == found.center_px
-    with pytest.raises(QsgmError, match=r"640x480 px has 160x120 at the scale of 'toy': expected"):
-        told.locate(DEMONSTRATION)
+    with pytest.raises(QsgmError, match=r"640x240 px has 160x60 at the scale of 'toy': expected"):
+        told.locate(DEMONSTRATION[:240])
+
+
+@pytest.mark.parametrize("center", [(30.0, 240.0), (320.0, 24.0), (600.0, 455.0)])
+def test_an_object_at_the_border_of_a_frame_is_found(bundle: Bundle, center: Point) -> None:
+    scene = lay(toy(), table(4), center, 65)
+    found, _ = Told(bundle, described(), center).locate(scene)
+    assert found.found
+    assert math.dist(found.center_px, center) < 1
+    assert found.margin_px == MARGIN_PX
 
 
 def test_of_several_looks_the_one_that_fits_is_taken_and_its_turn_added(bundle: Bundle) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from qsgm.bench.composing import CONDITIONS, Composer, Condition, Scene, Subject
 from qsgm.bench.cutouts import Frame
 from qsgm.bench.judging import Answer, Judged, Tally, Truth, judge, threshold_for, truth_of
-from qsgm.bundle import Bundle
+from qsgm.bundle import Bundle, Recipe
 from qsgm.finetuning import train
 from qsgm.predict import Detection
 from qsgm.preparing import Watch, prepare
@@ -62,11 +62,13 @@ class TunedMethod:
     name: str
     bundle: Bundle
     settings: Settings
+    recipe: Recipe | None = None  # optimizer and rates; None: the bundle's
 
     def answers(self, subject: Subject, scenes: Sequence[Frame]) -> list[Answer]:
         """Tune on the subject's demonstration and locate it in every scene."""
         prepared = prepare(subject.frame, self.bundle, self.settings)
-        tuned = train(prepared, self.settings, probe=False).tuned_object(subject.name)
+        result = train(prepared, self.settings, probe=False, recipe=self.recipe)
+        tuned = result.tuned_object(subject.name)
         answers = []
         for scene in scenes:
             began = time.perf_counter()

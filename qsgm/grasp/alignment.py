@@ -2,93 +2,104 @@
 
 The scene is moved so that the object lies as it was taught. What is left of the difference, once
 the light is made the same, says by the patch's own slopes how far off that is (inverse
-compositional, Baker and Matthews 2004); the slopes stay, so their normal equations do, too.
+compositional, Baker and Matthews 2004). Cells that disagree have little say, so that what hides a
+part of the object does not pull the rest along (iteratively reweighted least squares).
 """
 
 from dataclasses import dataclass, replace
-from math import sqrt
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, WINDOW_PX, Fit, Pyramid, Template
+from qsgm.grasp.cells import SIDE, Cells, Look, spread_out
+from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, Fit, Pyramid, Template
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
-SIDE = WINDOW_PX >> FINE
-_STEPS = 4
-_SLACK = 0.02
+_STEPS = 5
 # What a fit is off by before: right and down [px of the level], turn [rad], log of the scale.
 _EXPECTED_ERROR = np.array([1.0, 1.0, 0.05, 0.05])
 # Further from where it began, a fit has slid onto something else.
-_FURTHEST = np.array([4.0, 4.0, 0.15, 0.12])
+_FURTHEST = np.array([4.0, 4.0, 0.2, 0.15])
+# A step smaller than that is not worth another look.
+_NOTHING = np.array([0.03, 0.03, 0.001, 0.001])
 # Of the taught contrast, so much has to be there.
 _LEAST_GAIN = 0.2
 
 
 @dataclass(frozen=True)
 class Aligner:
-    """A patch's pixels and slopes at half of the resolution; D pixels, all channels together."""
+    """A patch's cells and slopes at half of the resolution; D numbers, all channels together."""
 
-    taught: Floats  # (D,) around each channel's mean
-    weight: Floats  # (D,) sums to 1 over each channel
-    solid: Floats  # (64, 64), 0 to 1
-    slopes: Floats  # (D, 4) by right, down, turn and log of the scale
-    normal: NDArray[np.float64]  # (4, 4)
-    variance: float  # of the patch, all channels together
+    cells: Cells
+    slopes: Floats  # (4, D) by right, down, turn and log of the scale
+    slope_means: Floats  # (C, 3, 4), of each cell
+    slope_products: Floats  # (C, 4, 4)
+    prior: Doubles  # (4, 4), keeps a step small where nothing says how far to go
     middle_px: tuple[float, float]  # of the mask (x, y) [px of the frame] from the patch's middle
 
     @staticmethod
     def of(template: Template) -> "Aligner":
         """Of the demonstration's patch."""
-        image, solid = upright(template)
-        of_each = [slopes(image[..., channel]) for channel in range(3)]
-        right, down = (np.dstack(one) / 2 for one in zip(*of_each, strict=True))
+        cells = Cells.of(template)
+        right, down = (one / 2 for one in slopes(cells.image))
         at = np.arange(SIDE, dtype=np.float32) - (SIDE - 1) / 2
         x, y = at[None, :, None], at[:, None, None]
         columns = (right, down, y * right - x * down, x * right + y * down)
-        flat = np.stack([_flattened(column, solid) for column in columns], axis=1)
-        total = max(float(solid.sum()), 1e-6)
-        weight = np.repeat(solid.ravel() / total, 3)
-        prior = np.diag(NOISE_VARIANCE / (total * _EXPECTED_ERROR**2))
-        normal = ((flat.T * weight) @ flat).astype(np.float64) + prior
-        across, below = (
-            (1 << FINE) * float((solid * along).sum()) / total for along in (x[..., 0], y[..., 0])
-        )
-        taught = _flattened(image, solid)
-        variance = float((weight * taught * taught).sum())
-        return Aligner(taught, weight, solid, flat, normal, variance, (across, below))
+        each = np.stack(columns, axis=-1).astype(np.float32)  # (64, 64, 3, 4)
+        inside = cells.solid[..., None, None] * each
+        means = _by_cell(inside, cells.size)
+        products = _by_cell(np.einsum("ijcd,ijce->ijde", inside, each), cells.size)
+        total = float(cells.solid.sum())
+        prior = np.diag(NOISE_VARIANCE / (max(total, 1.0) * _EXPECTED_ERROR**2))
+        along = (cells.solid * x[..., 0]).sum(), (cells.solid * y[..., 0]).sum()
+        across, below = ((1 << FINE) * float(one) / max(total, 1e-6) for one in along)
+        by_kind = np.ascontiguousarray(each.reshape(-1, 4).T)
+        return Aligner(cells, by_kind, means, products, prior, (across, below))
 
-    def aligned(self, scene: Pyramid, fit: Fit) -> Fit:
-        """The fit that is left once the patch seems to be off by nothing.
+    def look(self, scene: Pyramid, fit: Fit) -> Look:
+        """Compare the patch with the scene where a fit lays it."""
+        return self.cells.look(as_taught(scene, fit))
 
-        The given one where that leads away from it, or to a worse one.
-        """
-        here = fit
-        first, step = self._look(scene, here)
-        score = first
+    def aligned(self, scene: Pyramid, fit: Fit) -> tuple[Fit, Look]:
+        """The best fit met on the way to where the patch seems to be off by nothing."""
+        here, look = fit, self.look(scene, fit)
+        best = replace(fit, score=look.score), look
         for _ in range(_STEPS):
+            step = self._step(look)
             here = _stepped(here, step)
             if (_distances(here, fit) > _FURTHEST).any():
-                return replace(fit, score=first)
-            score, step = self._look(scene, here)
-        # Least squares and the highest correlation are not quite the same.
-        return replace(here, score=score) if score >= first - _SLACK else replace(fit, score=first)
+                break
+            look = self.look(scene, here)
+            if look.score > best[0].score:
+                best = replace(here, score=look.score), look
+            if (np.abs(step) < _NOTHING).all():
+                break
+        return best
 
-    def _look(self, scene: Pyramid, fit: Fit) -> tuple[float, NDArray[np.float64]]:
-        """Correlation of a fit, and by how much (4,) the patch seems to be off from it."""
-        seen = _flattened(as_taught(scene, fit), self.solid)
-        weighed = self.weight * seen
-        product, own = float(weighed @ self.taught), float(weighed @ seen)
-        score = product / sqrt((own + NOISE_VARIANCE) * (self.variance + NOISE_VARIANCE))
-        gain = product / max(self.variance, 1e-6)
-        if gain < _LEAST_GAIN:
-            return score, np.zeros(4)
-        left = self.weight * (seen / gain - self.taught)
-        step = np.linalg.solve(self.normal, (self.slopes.T @ left).astype(np.float64))
-        return score, np.asarray(step, dtype=np.float64)
+    def _step(self, look: Look) -> Doubles:
+        """By how much (4,) the patch seems to be off."""
+        trust = look.trust()
+        whole = look.whole(trust)
+        if whole.gain < _LEAST_GAIN:
+            return np.zeros(4)
+        means = np.tensordot(trust, self.slope_means, 1)  # (3, 4)
+        normal = np.tensordot(trust, self.slope_products, 1) - means.T @ means + self.prior
+        cells = self.cells
+        light = np.float32(1 / whole.gain)
+        level = (whole.taught_mean - whole.mean * light).astype(np.float32)
+        # Flat, and not broadcast over three channels, which numpy does in steps of three numbers.
+        left = look.seen.ravel() * light - cells.image.ravel()
+        left += np.tile(level, SIDE * SIDE)
+        left *= self._pixel_trust(trust)
+        return np.asarray(np.linalg.solve(normal, (self.slopes @ left).astype(np.float64)))
+
+    def _pixel_trust(self, trust: Floats) -> Floats:
+        """What each number of the difference counts (D,)."""
+        weight = spread_out(trust / self.cells.size) * self.cells.solid
+        return np.repeat(weight.ravel(), 3)
 
 
 def as_taught(scene: Pyramid, fit: Fit) -> Floats:
@@ -104,24 +115,24 @@ def as_taught(scene: Pyramid, fit: Fit) -> Floats:
     return np.asarray(seen, dtype=np.float32)
 
 
-def upright(template: Template) -> tuple[Floats, Floats]:
-    """Image (64, 64, 3) and mask (64, 64) in 0 to 1 of the patch's middle."""
-    layer = template.layer(FINE)
-    margin = (len(layer) - SIDE) // 2
-    middle = layer[margin : margin + SIDE, margin : margin + SIDE]
-    mask = middle[..., 3] / np.float32(255)
-    return np.ascontiguousarray(middle[..., :3]), np.ascontiguousarray(mask, dtype=np.float32)
-
-
 def slopes(image: Floats) -> tuple[Floats, Floats]:
-    """Derivatives to the right and down (h, w), central differences, 0 at the border."""
+    """Derivatives to the right and down (h, w, ...), central differences, 0 at the border."""
     right, down = np.zeros_like(image), np.zeros_like(image)
     right[:, 1:-1] = image[:, 2:] - image[:, :-2]
     down[1:-1] = image[2:] - image[:-2]
     return right, down
 
 
-def _stepped(fit: Fit, step: NDArray[np.float64]) -> Fit:
+def _by_cell(image: Floats, size: Floats) -> Floats:
+    """Means over every cell (C, ...) of an image (64, 64, ...)."""
+    count = round(len(size) ** 0.5)
+    cell = SIDE // count
+    blocks = image.reshape(count, cell, count, cell, *image.shape[2:]).sum(axis=(1, 3))
+    flat = blocks.reshape(len(size), *image.shape[2:])
+    return np.asarray(flat / size.reshape(-1, *[1] * (flat.ndim - 1)), dtype=np.float32)
+
+
+def _stepped(fit: Fit, step: Doubles) -> Fit:
     """The fit from which the patch is off by nothing, if it was off by `step` (4,)."""
     right, down, turn, growth = step
     angle, scale = fit.turn_rad - float(turn), fit.scale * float(np.exp(-growth))
@@ -132,7 +143,7 @@ def _stepped(fit: Fit, step: NDArray[np.float64]) -> Fit:
     return Fit(fit.score, angle, scale, (x, y))
 
 
-def _distances(one: Fit, other: Fit) -> NDArray[np.float64]:
+def _distances(one: Fit, other: Fit) -> Doubles:
     """How far apart two fits are: right, down [px of the level], turn and log of the scale."""
     (x, y), (other_x, other_y) = one.center_px, other.center_px
     halved = 1 << FINE
@@ -143,19 +154,3 @@ def _distances(one: Fit, other: Fit) -> NDArray[np.float64]:
         np.log(one.scale / other.scale),
     )
     return np.abs(values)
-
-
-def _flattened(image: NDArray[np.floating[Any]], solid: Floats) -> Floats:
-    """An image (64, 64, 3) around each channel's mean over the mask, as one row (D,)."""
-    mean = means(image, solid) / max(float(solid.sum()), 1e-6)
-    return np.asarray(around(image, mean).ravel(), dtype=np.float32)
-
-
-def means(image: NDArray[np.floating[Any]], weight: Floats) -> Floats:
-    """Sums of an image (h, w, 3) times a weight (h, w), by channel."""
-    return np.asarray(weight.ravel() @ image.reshape(-1, 3), dtype=np.float32)
-
-
-def around(image: NDArray[np.floating[Any]], level: Floats) -> NDArray[np.floating[Any]]:
-    """An image (h, w, 3) minus a level for each channel, faster than numpy takes it away itself."""
-    return (image.ravel() - np.tile(level, image.size // 3)).reshape(image.shape)

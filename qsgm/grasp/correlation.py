@@ -2,9 +2,8 @@
 
 Masked, normalised colour correlation: of the patch only the object's pixels count, each channel
 around its own mean, so that neither the table nor the light matters. Coarse to fine: at an eighth
-of the resolution every turn and a few scales are tried at every place within 24 px of a candidate;
-the best few go on to a quarter and to half of the resolution. All trials of one level are three
-matrix products.
+of the resolution every turn and a few scales are tried at every place within 16 px of a candidate;
+the best few go on to a quarter of it. All trials of one level are three matrix products.
 """
 
 from collections.abc import Sequence
@@ -30,11 +29,9 @@ NOISE_VARIANCE = 30.0
 _COARSE_POSES = tuple(
     (float(turn), scale) for scale in SCALES for turn in np.deg2rad(np.arange(0, 360, 10))
 )
-_COARSE_REACH = 3  # px of the level
+_COARSE_REACH = 2  # px of the level
 _MIDDLE_TURNS = (-radians(5), 0.0, radians(5))
 _MIDDLE_SCALES, _MIDDLE_REACH = (0.93, 1.0, 1.07), 2
-_FINE_TURNS = (-radians(2.5), 0.0, radians(2.5))
-_FINE_SCALES, _FINE_REACH = (0.97, 1.0, 1.03), 1
 # Turns that differ by less are the same hypothesis.
 _SAME_TURN = np.deg2rad(25)
 _STARTS = 3
@@ -114,7 +111,7 @@ def coarse_fits(
     Args:
         template: the demonstration's.
         scene: its frame.
-        centers_px: where to look, each within 24 px.
+        centers_px: where to look, each within 16 px.
 
     Returns:
         Up to three for each point, best first, their turns at least 25 degrees apart.
@@ -134,11 +131,6 @@ def middle_fit(template: Template, scene: Pyramid, start: Fit) -> Fit:
     return _refined(template, scene, MIDDLE, start, _MIDDLE_TURNS, _MIDDLE_SCALES, _MIDDLE_REACH)
 
 
-def refine_fit(template: Template, scene: Pyramid, fit: Fit) -> Fit:
-    """The same fit at half of the resolution, to be aligned from there."""
-    return _refined(template, scene, FINE, fit, _FINE_TURNS, _FINE_SCALES, _FINE_REACH)
-
-
 def _refined(
     template: Template,
     scene: Pyramid,
@@ -151,7 +143,8 @@ def _refined(
     poses = [(start.turn_rad + turn, start.scale * scale) for scale in scales for turn in turns]
     scores, places = _scores(template, scene, level, poses, start.center_px, reach)
     place, pose = np.unravel_index(int(scores.argmax()), scores.shape)
-    return Fit(float(scores[place, pose]), *poses[pose], tuple(places[place]))
+    x, y = places[place]
+    return Fit(float(scores[place, pose]), *poses[pose], (float(x), float(y)))
 
 
 def _distinct(scores: Floats, places: Floats, poses: Sequence[tuple[float, float]]) -> list[Fit]:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.angles import AngleEncoding, decode_angle
 from qsgm.crops import HALF_CROP_PX
 from qsgm.grasp.alignment import Aligner
 from qsgm.grasp.candidates import candidate_cells
+from qsgm.grasp.cells import Look
 from qsgm.grasp.correlation import (
     Fit,
     Pyramid,
@@ -21,7 +21,6 @@ from qsgm.grasp.correlation import (
     coarse_fits,
     middle_fit,
     pyramid_of,
-    refine_fit,
 )
 from qsgm.grasp.evidence import Reference, evidence, reference_of
 from qsgm.grasp.patch import PATCH_PX, Patch
@@ -31,14 +30,15 @@ CELL_PX = 16
 PROPOSED, JUDGED = 12, 4
 # What the network's log odds count beside a correlation when the few are chosen.
 _QUALITY_WEIGHT = 0.02
-# Of each of the few, so many turns are tried at a quarter of the resolution.
-_TURNS = 2
+# Of each of the few, so many turns are tried at a quarter of the resolution, if they fit nearly as
+# well as the best one.
+_TURNS, _NEARLY = 2, 0.2
 # Closer than that, two candidates are the same.
 _SAME_PX = 24.0
 # Turns that differ from a half turn by less are the opposite way round.
 _OPPOSITE_RAD = np.deg2rad(30)
 # With such a lead at a quarter of the resolution the other way round need not be looked at closer.
-_CLEAR_LEAD = 0.25
+_CLEAR_LEAD = 0.2
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Appearance:
     @staticmethod
     def of(patch: Patch) -> "Appearance":
         template = Template(patch)
-        return Appearance(template, reference_of(template), Aligner.of(template))
+        aligner = Aligner.of(template)
+        return Appearance(template, reference_of(aligner.cells), aligner)
 
     def center_of(self, fit: Fit) -> tuple[float, float]:
         """Where the object's centre (x, y) is in the frame that a fit lies over."""
@@ -68,7 +69,7 @@ class Candidate:
     evidence: NDArray[np.float32]  # (F,)
     center_px: tuple[float, float]  # of the object, by the fit
     cell_px: tuple[float, float]  # of the window by which the network proposed it
-    lead: float  # of the fit's correlation over that of the opposite way round
+    lead: float  # of the fit's score over that of the opposite way round
     quality: float  # of the network, in [0, 1]
 
 
@@ -77,7 +78,6 @@ class _Start:
     fits: tuple[Fit, ...]  # best first, at different turns
     cell: tuple[int, int]
     quality: float
-    angle_rad: float
 
     @property
     def promise(self) -> float:
@@ -89,8 +89,6 @@ def judge(
     appearance: Appearance,
     frame: NDArray[np.uint8],
     heatmap: NDArray[np.float32],
-    offset_rad: float,
-    encoding: AngleEncoding,
     count: int = JUDGED,
 ) -> list[Candidate]:
     """The most promising candidates of a frame.
@@ -99,20 +97,14 @@ def judge(
         appearance: of the taught object.
         frame: (H, W, 3) BGR.
         heatmap: (3, rows, cols) of that frame.
-        offset_rad: the demonstration's own orientation as the network sees it.
-        encoding: of the heatmap's angle.
         count: how many to judge at most.
     """
     scene = pyramid_of(frame)
     cells = candidate_cells(heatmap[0], max(PROPOSED, 2 * count))
     fits = coarse_fits(appearance.template, scene, [cell_center(cell) for cell in cells])
-    angles = [
-        float(decode_angle(heatmap[1, row, col], heatmap[2, row, col], encoding)) - offset_rad
-        for row, col in cells
-    ]
     starts = [
-        _Start(tuple(some), cell, float(heatmap[0][cell]), angle)
-        for some, cell, angle in zip(fits, cells, angles, strict=True)
+        _Start(tuple(some), cell, float(heatmap[0][cell]))
+        for some, cell in zip(fits, cells, strict=True)
     ]
     few = _apart(sorted(starts, key=lambda start: -start.promise), 2 * count)
     closer = [_closer(appearance.template, scene, start) for start in few]
@@ -123,14 +115,15 @@ def judge(
 def best_fit(
     appearance: Appearance, frame: NDArray[np.uint8], near_px: tuple[float, float]
 ) -> tuple[Fit, float]:
-    """How the patch lies best over a frame (H, W, 3) within 24 px of a point (x, y).
+    """How the patch lies best over a frame (H, W, 3) within 16 px of a point (x, y).
 
     Returns:
         The fit, and its lead over that of the opposite way round.
     """
     scene = pyramid_of(frame)
-    start = _Start(tuple(coarse_fits(appearance.template, scene, [near_px])[0]), (0, 0), 0.5, 0.0)
-    return _better_way_round(appearance, scene, _closer(appearance.template, scene, start))
+    start = _Start(tuple(coarse_fits(appearance.template, scene, [near_px])[0]), (0, 0), 0.5)
+    fit, _, lead = _better_way_round(appearance, scene, _closer(appearance.template, scene, start))
+    return fit, lead
 
 
 def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
@@ -140,35 +133,33 @@ def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
 
 
 def _closer(template: Template, scene: Pyramid, start: _Start) -> _Start:
-    fits = [middle_fit(template, scene, fit) for fit in start.fits[:_TURNS]]
+    least = start.fits[0].score - _NEARLY
+    some = [fit for fit in start.fits[:_TURNS] if fit.score >= least]
+    fits = [middle_fit(template, scene, fit) for fit in some]
     return replace(start, fits=tuple(sorted(fits, key=lambda fit: -fit.score)))
 
 
 def _candidate(appearance: Appearance, scene: Pyramid, start: _Start) -> Candidate:
-    fit, lead = _better_way_round(appearance, scene, start)
-    others = [other.score for other in start.fits[1:]]
-    ahead = start.fits[0].score - max(others, default=0.0)
-    facts = evidence(appearance.reference, scene, fit, start.quality, start.angle_rad, ahead)
+    fit, look, lead = _better_way_round(appearance, scene, start)
+    facts = evidence(appearance.reference, look, fit.scale, start.quality, lead)
     center = appearance.center_of(fit)
     return Candidate(fit, facts, center, cell_center(start.cell), lead, start.quality)
 
 
-def _better_way_round(appearance: Appearance, scene: Pyramid, start: _Start) -> tuple[Fit, float]:
+def _better_way_round(
+    appearance: Appearance, scene: Pyramid, start: _Start
+) -> tuple[Fit, Look, float]:
     """The better of the fit and its opposite, laid exactly, and its lead over the other."""
     first = start.fits[0]
     found = [other for other in start.fits[1:] if _is_opposite(first, other)]
     other = found[0] if found else _opposite(appearance, scene, first)
-    fit = _exact(appearance, scene, first)
+    fit, look = appearance.aligner.aligned(scene, first)
     if first.score - other.score > _CLEAR_LEAD:
-        return fit, first.score - other.score
-    opposite = _exact(appearance, scene, other)
-    better = max(fit, opposite, key=lambda one: one.score)
-    return better, abs(fit.score - opposite.score)
-
-
-def _exact(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
-    fine = refine_fit(appearance.template, scene, fit)
-    return appearance.aligner.aligned(scene, fine)
+        return fit, look, first.score - other.score
+    opposite, its_look = appearance.aligner.aligned(scene, other)
+    if opposite.score > fit.score:
+        return opposite, its_look, opposite.score - fit.score
+    return fit, look, fit.score - opposite.score
 
 
 def _is_opposite(one: Fit, other: Fit) -> bool:

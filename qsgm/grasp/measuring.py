@@ -3,7 +3,8 @@
 The network looks at windows of 128 px, in which an object should span 60 to 110. A photograph does
 not say how large its object is: so it is halved again and again, and cut out of every halving. A
 cut that is right gives the same span in two of them; one that is a part of the object, or table
-with it, hardly ever does.
+with it, hardly ever does. An object that is large in its frame has too little around it for that:
+it is cut out of the whole frame.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.grasp.patch import LARGEST_RADIUS_PX, PATCH_PX, cut_patch, mirrored_square
+from qsgm.grasp.patch import LARGEST_RADIUS_PX, PATCH_PX, cut_out, cut_patch, mirrored_square
 
 Frame = NDArray[np.uint8]
 Point = tuple[float, float]
@@ -23,10 +24,9 @@ Point = tuple[float, float]
 # A span between these is left as it is: the frame is not scaled at all.
 LEAST_SPAN_PX, LARGEST_SPAN_PX = 45.0, 124.0
 IDEAL_SPAN_PX = 90.0
-# Where a frame would get too small, the object may stay as large as that: a cut is often too large.
-MOST_SPAN_PX = 144.0
 MOST_ENLARGED = 2.0
-MIN_SIDE_PX = 256
+# An object that spans more of its frame's shorter side has nothing around it.
+LARGEST_SHARE = 0.95
 # Spans in two halvings that differ by less than this factor are of the same thing.
 _SAME_SPAN = 1.25
 # A cut that reaches the radius where GrabCut is told that everything is table was cut off there.
@@ -37,6 +37,12 @@ _LEAST_HALVED_PX = 3 * PATCH_PX // 4
 _LARGE_SHARE = 0.12
 # Of a halving's pixels: a cut that spans less is mostly noise.
 _LEAST_CUT_PX = 18.0
+# Cut out of the whole frame: its shorter side then, how far from the centre the object probably
+# reaches and surely is, and what it spans at least, as shares of that side.
+_WHOLE_PX, _PROBABLE_SHARE, _SURE_SHARE, _LEAST_WHOLE_SHARE = 96, 0.3, 0.12, 0.2
+# A span on which nothing agrees is a guess, and this share of the shorter side the largest.
+_LARGEST_GUESS = 0.5
+_RIM_PX = 2  # of the whole frame, made small: table, whatever it looks like
 
 
 def measured_span(frame: Frame, center_px: Point) -> float | None:
@@ -44,15 +50,9 @@ def measured_span(frame: Frame, center_px: Point) -> float | None:
 
     None where no two sizes of the frame agree on it.
     """
-    spans = _spans(frame, center_px)
-    agreed = _agreed(spans)
+    agreed = _agreed(_spans(frame, center_px)) or _span_of_large(frame, center_px)
     if agreed is None:
-        # Between the halvings, where an object may be that is too large in one, too small in two.
-        between = scaled_frame(frame, sqrt(0.5))
-        middle = moved_point(center_px, frame.shape[:2], between.shape[:2])
-        others = [span and span * sqrt(2) for span in _spans(between, middle)]
-        mixed = [span for both in zip_longest(spans, others) for span in both]
-        agreed = _agreed(mixed) or max((span for span in mixed if span), default=None)
+        agreed = _span_between(frame, center_px)
     if agreed is not None and agreed < LEAST_SPAN_PX:
         return _span_of_small(frame, center_px, agreed)
     return agreed
@@ -70,27 +70,28 @@ def scale_for(span_px: float | None, frame_hw: tuple[int, int]) -> float:
     """
     if span_px is None or LEAST_SPAN_PX <= span_px <= LARGEST_SPAN_PX:
         return 1.0
-    least = MIN_SIDE_PX / min(frame_hw)
-    wanted = min(IDEAL_SPAN_PX / span_px, MOST_ENLARGED)
-    if wanted >= least:
-        return wanted
-    if least * span_px > MOST_SPAN_PX:
+    if span_px > LARGEST_SHARE * min(frame_hw):
         height, width = frame_hw
         raise QsgmError(
             f"the object spans about {span_px:.0f} px of the {width}x{height} frame, which leaves "
-            "no room beside it: expected less than half of the shorter side; step back, or say how "
-            "large it is with --span"
+            "nothing around it to tell it from; step back, or say how large it is with --span"
         )
-    return least
+    return min(IDEAL_SPAN_PX / span_px, MOST_ENLARGED)
 
 
 def scaled_frame(frame: Frame, scale: float) -> Frame:
     """A frame (H, W, 3) made smaller by area or larger by bilinear interpolation."""
     if scale == 1.0:
         return frame
-    height, width = (max(round(side * scale), 1) for side in frame.shape[:2])
+    height, width = scaled_shape(frame.shape[:2], scale)
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(frame, (width, height), interpolation=how), dtype=np.uint8)
+
+
+def scaled_shape(frame_hw: tuple[int, ...], scale: float) -> tuple[int, int]:
+    """Height and width of a scaled frame."""
+    height, width = (max(round(side * scale), 1) for side in frame_hw)
+    return height, width
 
 
 def moved_point(point_px: Point, source_hw: tuple[int, int], target_hw: tuple[int, int]) -> Point:
@@ -113,6 +114,40 @@ def _spans(frame: Frame, center_px: Point) -> list[float | None]:
             break
         halved, times = scaled_frame(halved, 0.5), 2 * times
     return spans
+
+
+def _span_of_large(frame: Frame, center_px: Point) -> float | None:
+    """The span of an object that takes up much of its frame, by a cut of all of it."""
+    shorter = min(frame.shape[:2])
+    small = scaled_frame(frame, _WHOLE_PX / shorter)
+    x, y = moved_point(center_px, frame.shape[:2], small.shape[:2])
+    down, right = np.ogrid[: small.shape[0], : small.shape[1]]
+    away = np.hypot(right - x, down - y)
+    trimap = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
+    inner = slice(_RIM_PX, -_RIM_PX)
+    trimap[inner, inner] = cv2.GC_PR_BGD
+    trimap[away < _PROBABLE_SHARE * _WHOLE_PX] = cv2.GC_PR_FGD
+    found = cut_out(small, trimap).astype(np.uint8)
+    _, parts = cv2.connectedComponents(found)
+    middle = parts[(away < _SURE_SHARE * _WHOLE_PX) & (found > 0)]
+    if not middle.size:
+        return None
+    object_pixels = np.argwhere(parts == np.bincount(middle).argmax()).astype(np.float32)
+    span = float(max(cv2.minAreaRect(object_pixels)[1])) * shorter / _WHOLE_PX
+    return span if _LEAST_WHOLE_SHARE * shorter <= span else None
+
+
+def _span_between(frame: Frame, center_px: Point) -> float | None:
+    """Between the halvings, where an object may be that is too large in one, too small in two."""
+    spans = _spans(frame, center_px)
+    between = scaled_frame(frame, sqrt(0.5))
+    middle = moved_point(center_px, frame.shape[:2], between.shape[:2])
+    others = [span and span * sqrt(2) for span in _spans(between, middle)]
+    mixed = [span for both in zip_longest(spans, others) for span in both]
+    guess = max((span for span in mixed if span), default=None)
+    if guess is not None and guess > _LARGEST_GUESS * min(frame.shape[:2]):
+        guess = None
+    return _agreed(mixed) or guess
 
 
 def _span_of_small(frame: Frame, center_px: Point, span_px: float) -> float | None:

@@ -71,6 +71,18 @@ def cut_patch(frame: NDArray[np.uint8], center_px: tuple[float, float]) -> Patch
     return Patch(image, mask, (center_px[0] - left, center_px[1] - top), cut_out)
 
 
+def cut_out(image: NDArray[np.uint8], trimap: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """The object's pixels (h, w) of an image (h, w, 3), by GrabCut from a first guess (h, w)."""
+    no_rectangle = (0, 0, 0, 0)
+    models = np.zeros((2, 1, 65))
+    # GrabCut draws the centres of its colour clusters from OpenCV's own generator.
+    cv2.setRNGSeed(0)
+    labels, _, _ = cv2.grabCut(
+        image, trimap, no_rectangle, models[0], models[1], _ITERATIONS, cv2.GC_INIT_WITH_MASK
+    )
+    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+
+
 def encode_patch(patch: Patch) -> bytes:
     """Image and mask as a PNG with four channels."""
     bgra = np.dstack([patch.image, patch.mask])
@@ -119,19 +131,12 @@ def _reflected(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
 def _object_pixels(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     """The object's pixels (80, 80) at half the resolution, None where it cannot be cut out."""
     side = PATCH_PX // _SHRINK
-    small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
     radius = _radii(side) * _SHRINK
     trimap = np.full(radius.shape, cv2.GC_BGD, np.uint8)
     trimap[radius < LARGEST_RADIUS_PX] = cv2.GC_PR_BGD
     trimap[radius < _PROBABLE_RADIUS_PX] = cv2.GC_PR_FGD
-    models = np.zeros((2, 1, 65))
-    no_rectangle = (0, 0, 0, 0)
-    # GrabCut draws the centres of its colour clusters from OpenCV's own generator.
-    cv2.setRNGSeed(0)
-    cv2.grabCut(
-        small, trimap, no_rectangle, models[0], models[1], _ITERATIONS, cv2.GC_INIT_WITH_MASK
-    )
-    found = np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    found = cut_out(small, trimap)
     share = found.sum() / (radius < _PROBABLE_RADIUS_PX).sum()
     return found if _LEAST_SHARE < share < _LARGEST_SHARE else None
 

@@ -37,10 +37,10 @@ class JudgedScene:
 class DecisionConfig:
     """Sizes and rates of the fit."""
 
-    hidden: int = 16
+    hidden: int = 32
     steps: int = 1500
     peak_rate: float = 1e-2
-    weight_decay: float = 0.3
+    weight_decay: float = 1.0
     folds: int = 4  # the threshold is set on scenes whose episodes had no say in the weights
 
 

@@ -33,7 +33,7 @@ from qsgm.train.tasks import Task, TaskSet, make_task, shipped_things
 class DecisionScenesConfig:
     """How many objects and scenes the decision is made on."""
 
-    episodes: int = 96
+    episodes: int = 240
     scenes: int = 8  # with the object, and as many without it
     crops: int = 1000
     support: int = 800
@@ -65,8 +65,8 @@ def judged_scenes(
         numbers = range(first, min(first + config.tasks_at_once, config.episodes))
         episodes = [maker.draw(number, config.scenes, without=True) for number in numbers]
         taught = _teach(net, rule, start, episodes, config, seed)
-        for number, episode, (states, offset) in zip(numbers, episodes, taught, strict=True):
-            judged += _judge_all(number, episode, net, states, offset, rule.loss)
+        for number, episode, states in zip(numbers, episodes, taught, strict=True):
+            judged += _judge_all(number, episode, net, states, rule.loss)
             after_episode()
     return judged
 
@@ -78,8 +78,8 @@ def _teach(
     episodes: Sequence[Episode],
     config: DecisionScenesConfig,
     seed: int,
-) -> Iterator[tuple[list[LayerState], float]]:
-    """The tuned layers of every episode, and how its demonstration lies [rad]."""
+) -> Iterator[list[LayerState]]:
+    """The tuned layers of every episode."""
     tasks = [_task(net, episode, len(start), config, rule.loss, seed) for episode in episodes]
     together = TaskSet(
         torch.stack([task.features for task in tasks]),
@@ -87,8 +87,8 @@ def _teach(
         config.support,
     )
     *_, states = fine_tune(rule, start, together, config.epochs, seed)
-    for i, task in enumerate(tasks):
-        yield [_of_task(state, i) for state in states], task.offset_rad
+    for i in range(len(tasks)):
+        yield [_of_task(state, i) for state in states]
 
 
 def _task(
@@ -117,14 +117,13 @@ def _judge_all(
     episode: Episode,
     net: GraspNet,
     states: Sequence[LayerState],
-    offset_rad: float,
     loss: Loss,
 ) -> Iterator[JudgedScene]:
     appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
 
     def judged(scene: DrawnScene, center_px: tuple[float, float] | None) -> JudgedScene:
         seen = heatmap_of(net, states, scene.image, loss)
-        found = judge(appearance, scene.image, seen, offset_rad, loss.encoding)
+        found = judge(appearance, scene.image, seen)
         return JudgedScene(number, center_px, tuple(found))
 
     for scene in episode.scenes:

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from qsgm.crops import HALF_CROP_PX
 from qsgm.train.drawing.noise import mean_colour
-from qsgm.train.drawing.scenes import DrawnObject, DrawnScene, View, draw_object, draw_scene
+from qsgm.train.drawing.scenes import (
+    DrawnObject,
+    DrawnScene,
+    View,
+    draw_object,
+    draw_scene,
+    in_colours_of,
+)
 from qsgm.train.drawing.structures import STRUCTURE_KINDS
 from qsgm.train.drawing.tables import chosen_table, draw_table
 
@@ -40,10 +47,13 @@ class Difficulty:
     hidden: float  # up to a third
     dim: float
     blurred: float
+    alike: float  # that another thing has the taught one's colours
 
 
 # As scenes come: mostly one thing at a time.
-USUAL = Difficulty((0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.15, 0.15, 0.12, 0.1)
+USUAL = Difficulty(
+    (0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.15, 0.4, 0.12, 0.1, 0.3
+)
 
 
 @dataclass(frozen=True)
@@ -126,7 +136,8 @@ class EpisodeMaker:
         while True:
             other = self._others[rng.integers(len(self._others))]
             if other.kind != taught.kind:
-                return other
+                alike = rng.random() < self.difficulty.alike
+                return in_colours_of(other, taught) if alike else other
 
 
 def _as_photographed(scene: DrawnScene, rng: np.random.Generator, how: Difficulty) -> DrawnScene:

@@ -26,6 +26,7 @@ _SHADOW_MARGIN_PX = 48  # even; how far a shadow can fall
 _PUSH_PX, _PULL_PX = 12.0, 2.0  # steps in which a thing is moved out of the way, and back
 _TOUCHING_SHARE, _NEAR_SHARE = 0.35, 0.3  # of the other things; the rest lies anywhere
 _NEAR_PX = 40.0
+_DARKEST = 8.0  # levels; what is darker is repainted as if it were that
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -137,6 +138,13 @@ def draw_object(
     return _measured(kind, painted)
 
 
+def in_colours_of(thing: DrawnObject, model: DrawnObject) -> DrawnObject:
+    """A thing repainted so that its mean colour is another one's: told apart by its shape alone."""
+    wanted, own = (_mean_paint(one.painted) + _DARKEST for one in (model, thing))
+    colour = np.clip(np.rint(thing.painted.colour * (wanted / own)), 0, 255).astype(np.uint8)
+    return replace(thing, painted=replace(thing.painted, colour=colour))
+
+
 def draw_scene(
     rng: np.random.Generator,
     drawn: DrawnObject | None,
@@ -233,6 +241,11 @@ def _put_all(
         _put(image, thing, shade, height)
         _mark(owner, thing, 2)
     return owner, whole
+
+
+def _mean_paint(painted: Painted) -> NDArray[np.float64]:
+    """Mean colour (3,) inside the outline."""
+    return np.asarray(painted.colour[painted.coverage > 127].mean(axis=0))
 
 
 def _kept(painted: Painted) -> Painted:

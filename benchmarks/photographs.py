@@ -1,0 +1,150 @@
+"""Real photographs: taught on an object's first one, looked for in its others and in other things'.
+
+    python benchmarks/photographs.py DIR [--bundle export] [--int8] [--others 12] [--json FILE]
+
+DIR holds photographs and `manifest.json`, a list of objects:
+
+    [{"object": "mug", "photos": [{"file": "mug/0.jpg", "center_px": [310, 220],
+      "long_side_px": 140, "turn_deg": 0, "contains": ["mug"]}, ...]}, ...]
+
+The first photograph of each is its demonstration; nothing but its centre is told. A place is right
+within 0.27 of the object's long side (24 px of 90) of the true centre. `turn_deg` is since the
+demonstration, counter-clockwise, or null; `contains` (optional) names all objects of the list that
+are in a photograph, which then is no photograph without them. Photographs of nothing on the list
+may be named in `negatives.json`, a list of files.
+"""
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from qsgm import QsgmError, Settings, load_bundle
+from qsgm.bundle import Bundle
+from qsgm.finetuning import train
+from qsgm.images import read_frame
+from qsgm.preparing import prepare
+from qsgm.tuned import TunedObject
+
+RIGHT_SHARE = 0.27
+FALSE_ALARMS = 0.02
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was found in one photograph."""
+
+    object: str
+    file: str
+    present: bool
+    found: bool
+    quality: float
+    right: bool
+    turn_error_deg: float | None
+
+
+def answers_of(
+    number: int, objects: Sequence[Any], folder: Path, bundle: Bundle, int8: bool, others: int
+) -> Iterator[Answer]:
+    """Teach one object, look for it where it is and where it is not."""
+    one = objects[number]
+    first, *more = one["photos"]
+    precision = "int8" if int8 else "float"
+    settings = Settings(precision=precision, center_px=tuple(map(float, first["center_px"])))  # type: ignore[arg-type]
+    prepared = prepare(read_frame(folder / first["file"]), bundle, settings)
+    taught = train(prepared, settings, probe=False).tuned_object(one["object"])
+    for photo in more:
+        yield _answer(taught, folder, photo)
+    for file in _without(number, objects, folder, others):
+        yield _answer(taught, folder, {"file": file})
+
+
+def _without(number: int, objects: Sequence[Any], folder: Path, count: int) -> list[str]:
+    """Photographs in which the object is not: others', then of nothing on the list."""
+    name, rng = objects[number]["object"], np.random.default_rng(number)
+    free = [
+        photo["file"]
+        for other in objects
+        if other["object"] != name
+        for photo in other["photos"]
+        if name not in photo.get("contains", ())
+    ]
+    listed = folder / "negatives.json"
+    nothing = json.loads(listed.read_text()) if listed.exists() else []
+    chosen = [free[i] for i in rng.permutation(len(free))[:count]]
+    files = [one["file"] if isinstance(one, dict) else one for one in nothing]
+    return chosen + [files[i] for i in rng.permutation(len(files))[: count // 3]]
+
+
+def _answer(taught: TunedObject, folder: Path, photo: dict[str, Any]) -> Answer:
+    center, name = photo.get("center_px"), taught.description.name
+    try:
+        found, _ = taught.locate(read_frame(folder / photo["file"]))
+    except QsgmError:  # too small at the object's scale: nothing is found in it
+        return Answer(name, photo["file"], center is not None, False, 0.0, False, None)
+    right, turn = False, None
+    if center is not None:
+        right = math.dist(found.center_px, center) <= RIGHT_SHARE * photo["long_side_px"]
+        if right and photo.get("turn_deg") is not None:
+            turn = abs((found.angle_deg - photo["turn_deg"] + 90) % 180 - 90)
+    return Answer(name, photo["file"], center is not None, found.found, found.quality, right, turn)
+
+
+def table_of(answers: Sequence[Answer], refused: int, objects: int) -> Table:
+    """What a reader wants to know of all answers."""
+    present = [one for one in answers if one.present]
+    absent = [one for one in answers if not one.present]
+    threshold = float(np.quantile([one.quality for one in absent], 1 - FALSE_ALARMS))
+    turns = [one.turn_error_deg for one in present if one.found and one.turn_error_deg is not None]
+    table = Table("", "", title=f"{objects} objects, {refused} of them refused")
+    rows = {
+        "photographs with the object": len(present),
+        "found in the right place": sum(one.found and one.right for one in present),
+        "found in a wrong place": sum(one.found and not one.right for one in present),
+        "first guess in the right place": sum(one.right for one in present),
+        "photographs without it": len(absent),
+        "found though absent": sum(one.found for one in absent),
+        "right at 2 % found though absent": sum(
+            one.right and one.quality > threshold for one in present
+        ),
+        "median turn error": f"{np.median(turns):.1f} deg" if turns else "-",
+    }
+    for name, value in rows.items():
+        table.add_row(name, str(value))
+    return table
+
+
+def main() -> None:
+    """Measure, print, and write what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--bundle", type=Path, default=Path("export"))
+    parser.add_argument("--int8", action="store_true")
+    parser.add_argument("--others", type=int, default=12, help="photographs without each object")
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    objects = json.loads((asked.folder / "manifest.json").read_text())
+    bundle, answers, refused = load_bundle(asked.bundle), [], []
+    for number in track(range(len(objects)), console=Console(stderr=True)):
+        name = objects[number]["object"]
+        try:
+            some = answers_of(number, objects, asked.folder, bundle, asked.int8, asked.others)
+            answers += list(some)
+        except QsgmError as error:
+            refused.append({"object": name, "why": str(error)})
+    Console().print(table_of(answers, len(refused), len(objects)))
+    if asked.json is not None:
+        values = {"answers": [asdict(one) for one in answers], "refused": refused}
+        asked.json.write_text(json.dumps(values, indent=1))
+
+
+if __name__ == "__main__":
+    main()
