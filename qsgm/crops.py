@@ -146,17 +146,16 @@ def label_crops(
     return np.concatenate([plan.quality[:, None], angle * plan.quality[:, None]], axis=1)
 
 
-def check_center(
-    frame_hw: tuple[int, int], center_px: tuple[float, float], margin_px: float = HALF_CROP_PX
-) -> None:
-    """Refuse a point (x, y) that is closer than a margin to the border of a frame.
+def check_center(frame_hw: tuple[int, int], center_px: tuple[float, float]) -> None:
+    """Refuse a point (x, y) whose window leaves a frame.
 
     Raises:
-        QsgmError: says how large the margin has to be in the end.
+        QsgmError: says how far inside it has to be.
     """
     height, width = frame_hw
     x, y = center_px
-    if not (margin_px <= x <= width - margin_px and margin_px <= y <= height - margin_px):
+    margin = HALF_CROP_PX
+    if not (margin <= x <= width - margin and margin <= y <= height - margin):
         raise QsgmError(
             f"the object's centre ({x:g}, {y:g}) is closer than {HALF_CROP_PX} px to the border "
             f"of the {width}x{height} frame; move the camera or pass another --center"

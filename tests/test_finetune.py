@@ -25,6 +25,7 @@ from qsgm.preparing import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepa
 from qsgm.quantize import SgmRanges, constants, quantize_sgm
 from qsgm.report import finetune_json, to_json
 from qsgm.settings import Settings
+from qsgm.tuned import MARGIN_PX
 from qsgm.tuning import BATCH
 from qsgm.weights import to_step_layout
 
@@ -92,8 +93,17 @@ def test_the_object_may_lie_elsewhere_in_the_frame(frame: Frame, bundle: Bundle)
     crops = planned(frame, bundle, (250.0, 280.0)).cut(np.arange(20))
     expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
     np.testing.assert_allclose(prepared.features[:20], expected, atol=1e-5)
-    with pytest.raises(QsgmError, match="closer than 64 px to the border"):
-        prepare(frame, bundle, replace(SHORT, center_px=(30.0, 240.0)))
+    with pytest.raises(QsgmError, match="outside of the 640x480 frame"):
+        prepare(frame, bundle, replace(SHORT, center_px=(640.5, 240.0)))
+
+
+def test_an_object_at_the_border_is_taught_with_its_frame_continued(
+    frame: Frame, bundle: Bundle
+) -> None:
+    prepared = prepare(frame, bundle, replace(SHORT, center_px=(30.0, 240.0)))
+    (shown,) = prepared.shown.demonstrations
+    assert shown.frame.shape == (480, 640 + 66, 3)
+    assert shown.center_px == (96.0, 240.0)
 
 
 def test_labels_are_shifted_by_the_orientation_the_network_sees(
@@ -545,7 +555,10 @@ def test_a_photograph_with_a_large_object_is_taught_and_found_in_its_own_pixels(
     result.save(tmp_path / "toy", "toy")
     tuned = load_object(tmp_path / "toy")
     assert tuned.description.scale == pytest.approx(values["scale"], abs=1e-4)
-    monkey = bump([shown.center_px], shown.frame.shape[:2])
+    x, y = shown.center_px
+    height, width = shown.frame.shape[:2]
+    wide = height + 2 * MARGIN_PX, width + 2 * MARGIN_PX
+    monkey = bump([(x + MARGIN_PX, y + MARGIN_PX)], wide)
     tuned.heatmap = lambda _frame: monkey  # type: ignore[method-assign]
     found, _ = tuned.locate(photograph)
     assert found.refined_by == "patch"

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from qsgm.crops import check_center
+from qsgm.errors import QsgmError
 from qsgm.grasp.judge import Appearance, best_fit
 from qsgm.grasp.measuring import (
     LARGEST_SPAN_PX,
@@ -74,7 +74,7 @@ def shown(demonstrations: Sequence[Demonstration], span_px: float | None = None)
         QsgmError: the object fills its frame, or its centre is not in it.
     """
     for one in demonstrations:
-        check_center(one.frame.shape[:2], one.center_px, margin_px=0)  # scaled, it may be inside
+        _check_inside(one)
     first, *others = demonstrations
     measured = measured_span(first.frame, first.center_px) if span_px is None else span_px
     scale = scale_for(measured, first.frame.shape[:2])
@@ -84,6 +84,16 @@ def shown(demonstrations: Sequence[Demonstration], span_px: float | None = None)
     turns = (0.0, *_turns_since(patches[0], ready[1:]))
     sums = tuple(hashlib.sha256(one.frame.tobytes()).hexdigest() for one in demonstrations)
     return Shown(tuple(ready), tuple(patches), turns, measured, scale, sums)
+
+
+def _check_inside(one: Demonstration) -> None:
+    height, width = one.frame.shape[:2]
+    x, y = one.center_px
+    if not (0 <= x <= width and 0 <= y <= height):
+        raise QsgmError(
+            f"the object's centre ({x:g}, {y:g}) is outside of the {width}x{height} frame; "
+            "pass another --center"
+        )
 
 
 def _own_scale(one: Demonstration, scale: float) -> float:
