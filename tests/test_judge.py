@@ -10,7 +10,7 @@ from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.finding import confidence_of, full_degrees
 from qsgm.grasp.judge import JUDGED, Appearance, cell_center, judge
-from qsgm.grasp.patch import cut_patch
+from qsgm.grasp.patch import Patch, cut_patch
 
 CENTER = (320.0, 240.0)
 APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
@@ -78,3 +78,22 @@ def test_without_a_lead_both_ways_round_are_as_likely_and_more_of_it_is_surer() 
 )
 def test_a_full_turn_is_in_half_open_degrees(turn: float, degrees: float) -> None:
     assert full_degrees(math.radians(turn)) == pytest.approx(degrees, abs=1e-9)
+
+
+@pytest.mark.parametrize("pixel", [(0, 0), (159, 159), (80, 80), None])
+@pytest.mark.parametrize("grey", [0, 255, None])
+def test_any_patch_and_frame_give_finite_evidence(
+    pixel: tuple[int, int] | None, grey: int | None
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (160, 160, 3)).astype(np.uint8)
+    image = noise if grey is None else np.full_like(noise, grey)
+    mask = np.full((160, 160), 255 if pixel is None else 0, np.uint8)
+    if pixel is not None:
+        mask[pixel] = 255
+    appearance = Appearance.of(Patch(image, mask))
+    heatmap = rng.uniform(0, 1, (3, 10, 12)).astype(np.float32)
+    for frame in (np.zeros((300, 330, 3), np.uint8), np.tile(noise, (2, 3, 1))[:300, :330]):
+        for one in judge(appearance, frame, heatmap):
+            assert np.isfinite(one.evidence).all()
+            assert np.isfinite([*one.center_px, one.lead, one.fit.score]).all()
