@@ -6,7 +6,7 @@ from typing import Literal
 EPOCHS = 20
 SHORT_RUNS = "1,3"  # epochs, of `bench accuracy`
 LAYERS = 3  # tuned
-# Of the SGMs: as accurate as int8 and the quicker one at these widths (README).
+# Of the SGMs: as accurate as int8 and the quicker one at these widths (docs/cost.md).
 PRECISION: Literal["int8", "float"] = "float"
 SLIM_BLOCKS = "4,5,6"  # those, each on its own
 MOST_LAYERS = 6  # that can be tuned

@@ -1,4 +1,4 @@
-"""`qsgm bench`: what the README states, measured."""
+"""`qsgm bench`: what the pages in docs/ state, measured."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from qsgm.bench.frames import BenchFrame
     from qsgm.bench.rivals import Rival
 
-app = typer.Typer(help="Measure what the README states.")
+app = typer.Typer(help="Measure what the pages in docs/ state.")
 
 
 class SceneCondition(StrEnum):
