@@ -1,6 +1,6 @@
 """Real photographs: taught on an object's first one, looked for in its others and in other things'.
 
-    python benchmarks/photographs.py DIR [--bundle export] [--int8] [--others 12] [--json FILE]
+    python benchmarks/photographs.py DIR [--int8] [--any-distance] [--others 12] [--json FILE]
 
 DIR holds photographs and `manifest.json`, a list of objects:
 
@@ -18,7 +18,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,24 +51,35 @@ class Answer:
     turn_error_deg: float | None
 
 
-def answers_of(
-    number: int, objects: Sequence[Any], folder: Path, bundle: Bundle, int8: bool, others: int
-) -> Iterator[Answer]:
+@dataclass(frozen=True)
+class Job:
+    """What is measured, and how."""
+
+    folder: Path
+    objects: Sequence[Any]  # of the manifest
+    bundle: Bundle
+    settings: Settings
+    any_distance: bool
+    others: int  # photographs without each object
+
+
+def answers_of(job: Job, number: int) -> Iterator[Answer]:
     """Teach one object, look for it where it is and where it is not."""
-    one = objects[number]
+    one, folder, bundle = job.objects[number], job.folder, job.bundle
     first, *more = one["photos"]
-    precision = "int8" if int8 else "float"
-    settings = Settings(precision=precision, center_px=tuple(map(float, first["center_px"])))  # type: ignore[arg-type]
+    x, y = map(float, first["center_px"])
+    settings = replace(job.settings, center_px=(x, y))
     prepared = prepare(read_frame(folder / first["file"]), bundle, settings)
     taught = train(prepared, settings, probe=False).tuned_object(one["object"])
     for photo in more:
-        yield _answer(taught, folder, photo)
-    for file in _without(number, objects, folder, others):
-        yield _answer(taught, folder, {"file": file})
+        yield _answer(job, taught, photo)
+    for file in _without(job, number):
+        yield _answer(job, taught, {"file": file})
 
 
-def _without(number: int, objects: Sequence[Any], folder: Path, count: int) -> list[str]:
+def _without(job: Job, number: int) -> list[str]:
     """Photographs in which the object is not: others', then of nothing on the list."""
+    objects, count = job.objects, job.others
     name, rng = objects[number]["object"], np.random.default_rng(number)
     free = [
         photo["file"]
@@ -77,17 +88,18 @@ def _without(number: int, objects: Sequence[Any], folder: Path, count: int) -> l
         for photo in other["photos"]
         if name not in photo.get("contains", ())
     ]
-    listed = folder / "negatives.json"
+    listed = job.folder / "negatives.json"
     nothing = json.loads(listed.read_text()) if listed.exists() else []
     chosen = [free[i] for i in rng.permutation(len(free))[:count]]
     files = [one["file"] if isinstance(one, dict) else one for one in nothing]
     return chosen + [files[i] for i in rng.permutation(len(files))[: count // 3]]
 
 
-def _answer(taught: TunedObject, folder: Path, photo: dict[str, Any]) -> Answer:
+def _answer(job: Job, taught: TunedObject, photo: dict[str, Any]) -> Answer:
     center, name = photo.get("center_px"), taught.description.name
     try:
-        found, _ = taught.locate(read_frame(folder / photo["file"]))
+        look = taught.locate_at_any_distance if job.any_distance else taught.locate
+        found, _ = look(read_frame(job.folder / photo["file"]))
     except QsgmError:  # too small at the object's scale: nothing is found in it
         return Answer(name, photo["file"], center is not None, False, 0.0, False, None)
     right, turn = False, None
@@ -128,16 +140,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--bundle", type=Path, default=Path("export"))
     parser.add_argument("--int8", action="store_true")
+    parser.add_argument("--any-distance", action="store_true")
     parser.add_argument("--others", type=int, default=12, help="photographs without each object")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     objects = json.loads((asked.folder / "manifest.json").read_text())
-    bundle, answers, refused = load_bundle(asked.bundle), [], []
+    settings = Settings(precision="int8" if asked.int8 else "float")
+    bundle = load_bundle(asked.bundle)
+    job = Job(asked.folder, objects, bundle, settings, asked.any_distance, asked.others)
+    answers, refused = [], []
     for number in track(range(len(objects)), console=Console(stderr=True)):
         name = objects[number]["object"]
         try:
-            some = answers_of(number, objects, asked.folder, bundle, asked.int8, asked.others)
-            answers += list(some)
+            answers += list(answers_of(job, number))
         except QsgmError as error:
             refused.append({"object": name, "why": str(error)})
     Console().print(table_of(answers, len(refused), len(objects)))

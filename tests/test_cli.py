@@ -226,6 +226,15 @@ def test_the_object_tuned_last_is_the_one_predict_uses(
     assert qsgm("predict", "--json", frame_path).json["object"] == "bar"
 
 
+def test_any_distance_is_told_by_the_scale_and_not_for_all_instances(
+    qsgm: Run, taught: Path, frame_path: Path
+) -> None:
+    values = qsgm("predict", "--json", "--any-distance", "--object", taught, frame_path).json
+    assert values["scale"] in (1, 0.5, 0.71429, 1.42857, 2)
+    both = qsgm("predict", "--all", "--any-distance", "--object", taught, frame_path)
+    assert_refused(both, 2, "--all looks at the demonstration's distance only")
+
+
 def test_predict_writes_nothing_unless_told_to(
     qsgm: Run, taught: Path, frame_path: Path, tmp_path: Path
 ) -> None:

@@ -291,6 +291,31 @@ def test_an_object_at_the_border_of_a_frame_is_found(bundle: Bundle, center: Poi
     assert found.margin_px == MARGIN_PX
 
 
+@pytest.mark.parametrize("size", [0.5, 2.0])
+def test_an_object_at_another_distance_is_found_where_that_is_asked_for(
+    bundle: Bundle, size: float
+) -> None:
+    center = (310.0, 230.0)
+    scene = lay(toy(), table(4), center, 40, size)
+    x, y = ((value + 0.5) / size - 0.5 for value in center)
+    told = Told(bundle, described(), (x, y))
+    assert not told.locate(scene)[0].found
+    found, heatmap = told.locate_at_any_distance(scene)
+    assert found.found
+    assert math.dist(found.center_px, center) < 2
+    assert turn_error(found.full_angle_deg, 40) < 1
+    assert found.scale == 1 / size
+    assert heatmap.shape != told.locate(scene)[1].shape
+    assert told.description.scale == 1
+
+
+def test_at_any_distance_what_is_not_there_is_not_found(bundle: Bundle) -> None:
+    told = Told(bundle, described(), (300.0, 200.0))
+    found, _ = told.locate_at_any_distance(table(3))
+    assert not found.found
+    assert found.scale == 1
+
+
 def test_of_several_looks_the_one_that_fits_is_taken_and_its_turn_added(bundle: Bundle) -> None:
     back = toy()[..., [2, 1, 0, 3]]
     frame = lay(back, table(1), CENTER)

@@ -230,6 +230,12 @@ def predict(
     everything: Annotated[
         bool, typer.Option("--all", help="List every instance of the object.")
     ] = False,
+    any_distance: Annotated[
+        bool,
+        typer.Option(
+            "--any-distance", help="Where it is not found, look at half to twice the distance, too."
+        ),
+    ] = False,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,
@@ -242,9 +248,12 @@ def predict(
     from qsgm.report import detection_table, instances_table, predict_json
     from qsgm.tuned import load_object
 
+    if everything and any_distance:
+        raise typer.BadParameter("--all looks at the demonstration's distance only")
     found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
     frame = read_frame(scene)
-    detection, heatmap = found.locate(frame)
+    look = found.locate_at_any_distance if any_distance else found.locate
+    detection, heatmap = look(frame)
     instances = found.locate_all(frame) if everything else None
     name = found.description.name
     if output is not None:
