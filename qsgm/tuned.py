@@ -123,7 +123,7 @@ class TunedObject:
         for size in OTHER_SIZES:
             scale = self.description.scale / size
             sides = scaled_shape(frame.shape[:2], scale)
-            if min(sides) >= _LEAST_SIDE_PX and max(sides) <= _LARGEST_SIDE_PX:
+            if min(sides) >= self._least_side_px and max(sides) <= _LARGEST_SIDE_PX:
                 other = copy(self)
                 other.description = replace(self.description, scale=scale)
                 yield other
@@ -162,6 +162,11 @@ class TunedObject:
         """Objects of version 1 see frames as they are."""
         return MARGIN_PX if self.description.views else 0
 
+    @property
+    def _least_side_px(self) -> int:
+        """What has to be left of a frame at the object's scale."""
+        return _LEAST_SIDE_PX if self._margin_px else CROP_PX
+
     def _seen(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The frame at the object's scale, mirrored beyond its border.
 
@@ -169,7 +174,7 @@ class TunedObject:
             QsgmError: too little is left of it.
         """
         scaled, margin = scaled_frame(frame, self.description.scale), self._margin_px
-        least = _LEAST_SIDE_PX if margin else CROP_PX
+        least = self._least_side_px
         if min(scaled.shape[:2]) < least:
             (height, width), (low, narrow) = frame.shape[:2], scaled.shape[:2]
             raise QsgmError(

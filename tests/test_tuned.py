@@ -316,6 +316,16 @@ def test_at_any_distance_what_is_not_there_is_not_found(bundle: Bundle) -> None:
     assert found.scale == 1
 
 
+def test_an_object_of_the_first_version_is_not_looked_for_where_a_window_does_not_fit(
+    saved: Path, frame: NDArray[np.uint8]
+) -> None:
+    tuned = load_object(saved)
+    assert not tuned.description.views
+    tuned.heatmap = lambda _frame: np.zeros((3, 1, 1), np.float32)  # type: ignore[method-assign]
+    found, _ = tuned.locate_at_any_distance(frame[:128, :128])
+    assert (found.found, found.scale) == (False, 1)
+
+
 def test_of_several_looks_the_one_that_fits_is_taken_and_its_turn_added(bundle: Bundle) -> None:
     back = toy()[..., [2, 1, 0, 3]]
     frame = lay(back, table(1), CENTER)

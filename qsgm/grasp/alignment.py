@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.cells import SIDE, Cells, Look, spread_out
+from qsgm.grasp.cells import SIDE, Cells, Look, spread_out, sums_by_cell
 from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, Fit, Pyramid, Template
 
 Floats = NDArray[np.float32]
@@ -50,14 +50,20 @@ class Aligner:
         columns = (right, down, y * right - x * down, x * right + y * down)
         each = np.stack(columns, axis=-1).astype(np.float32)  # (64, 64, 3, 4)
         inside = cells.solid[..., None, None] * each
-        means = _by_cell(inside, cells.size)
-        products = _by_cell(np.einsum("ijcd,ijce->ijde", inside, each), cells.size)
+        products = np.einsum("ijcd,ijce->ijde", inside, each)
         total = float(cells.solid.sum())
         prior = np.diag(NOISE_VARIANCE / (max(total, 1.0) * _EXPECTED_ERROR**2))
         along = (cells.solid * x[..., 0]).sum(), (cells.solid * y[..., 0]).sum()
         across, below = ((1 << FINE) * float(one) / max(total, 1e-6) for one in along)
         by_kind = np.ascontiguousarray(each.reshape(-1, 4).T)
-        return Aligner(cells, by_kind, means, products, prior, (across, below))
+        return Aligner(
+            cells,
+            by_kind,
+            _means(inside, cells).reshape(-1, 3, 4),
+            _means(products, cells).reshape(-1, 4, 4),
+            prior,
+            (across, below),
+        )
 
     def look(self, scene: Pyramid, fit: Fit) -> Look:
         """Compare the patch with the scene where a fit lays it."""
@@ -123,13 +129,10 @@ def slopes(image: Floats) -> tuple[Floats, Floats]:
     return right, down
 
 
-def _by_cell(image: Floats, size: Floats) -> Floats:
-    """Means over every cell (C, ...) of an image (64, 64, ...)."""
-    count = round(len(size) ** 0.5)
-    cell = SIDE // count
-    blocks = image.reshape(count, cell, count, cell, *image.shape[2:]).sum(axis=(1, 3))
-    flat = blocks.reshape(len(size), *image.shape[2:])
-    return np.asarray(flat / size.reshape(-1, *[1] * (flat.ndim - 1)), dtype=np.float32)
+def _means(image: Floats, cells: Cells) -> Floats:
+    """Of every cell (C, K) of an image (64, 64, ...) with K numbers a pixel."""
+    sums = sums_by_cell(image.reshape(SIDE, SIDE, -1))
+    return np.asarray(sums / cells.size[:, None], dtype=np.float32)
 
 
 def _stepped(fit: Fit, step: Doubles) -> Fit:

@@ -41,8 +41,8 @@ class Cells:
         image, solid = upright(template)
         each = np.repeat(solid[..., None], _CHANNELS, axis=2)
         covered = image * each
-        size = np.maximum(_summed(solid[..., None])[:, 0], np.float32(_TINY))
-        mean = np.asarray(_summed(covered) / size[:, None], dtype=np.float32)
+        size = np.maximum(sums_by_cell(solid[..., None])[:, 0], np.float32(_TINY))
+        mean = np.asarray(sums_by_cell(covered) / size[:, None], dtype=np.float32)
         square = _summed_all(covered * image) / size
         spread = square - (mean * mean).sum(axis=1)
         variance = np.clip(spread, 0, None).astype(np.float32)
@@ -52,7 +52,7 @@ class Cells:
         """Compare what is seen (64, 64, 3) where the object should be."""
         covered = seen * self.solid_of_each
         size = self.size
-        mean = _summed(covered) / size[:, None]
+        mean = sums_by_cell(covered) / size[:, None]
         square = _summed_all(covered * seen) / size
         product = _summed_all(covered * self.image) / size
         variance = np.maximum(square - (mean * mean).sum(axis=1), 0.0)
@@ -130,7 +130,7 @@ def spread_out(of_cells: Floats) -> Floats:
     return np.ascontiguousarray(whole).reshape(SIDE, SIDE)
 
 
-def _summed(image: Floats) -> Floats:
+def sums_by_cell(image: Floats) -> Floats:
     """Sums over every cell (C, K) of an image (64, 64, K)."""
     rows = image.reshape(ACROSS, CELL, -1).sum(axis=1)
     return np.asarray(rows.reshape(ACROSS * ACROSS, CELL, -1).sum(axis=1), dtype=np.float32)

@@ -50,9 +50,10 @@ def measured_span(frame: Frame, center_px: Point) -> float | None:
 
     None where no two sizes of the frame agree on it.
     """
-    agreed = _agreed(_spans(frame, center_px)) or _span_of_large(frame, center_px)
+    spans = _spans(frame, center_px)
+    agreed = _agreed(spans) or _span_of_large(frame, center_px)
     if agreed is None:
-        agreed = _span_between(frame, center_px)
+        agreed = _span_between(frame, center_px, spans)
     if agreed is not None and agreed < LEAST_SPAN_PX:
         return _span_of_small(frame, center_px, agreed)
     return agreed
@@ -137,9 +138,8 @@ def _span_of_large(frame: Frame, center_px: Point) -> float | None:
     return span if _LEAST_WHOLE_SHARE * shorter <= span else None
 
 
-def _span_between(frame: Frame, center_px: Point) -> float | None:
+def _span_between(frame: Frame, center_px: Point, spans: Sequence[float | None]) -> float | None:
     """Between the halvings, where an object may be that is too large in one, too small in two."""
-    spans = _spans(frame, center_px)
     between = scaled_frame(frame, sqrt(0.5))
     middle = moved_point(center_px, frame.shape[:2], between.shape[:2])
     others = [span and span * sqrt(2) for span in _spans(between, middle)]
