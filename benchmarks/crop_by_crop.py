@@ -19,13 +19,13 @@ from rich.table import Table
 from qsgm.bench.step_jobs import median_seconds, still_loop
 from qsgm.blocks import single_layers
 from qsgm.runtime import open_session
-from qsgm.train.calibration_runs import Trainee, prepare
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.graphs import layers
 from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.step import step_model
 from qsgm.train.liveness import live_peak, traced
-from qsgm.tuning import BATCH
+from qsgm.train.quantization.calibration_runs import Trainee, prepare
+from qsgm.tune.loop import BATCH
 from qsgm.weights import to_step_layout
 
 LIMITS = {"at once": inf, "as shipped": layers.MANY_WINDOWS, "layer 4, too": 20}

@@ -20,19 +20,19 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.baselines.backpropagation import Backpropagation
-from qsgm.train.baselines.tuning import Recipe, adam, run_baseline, sgd
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.evaluate import UpdateRule, fine_tune, score
-from qsgm.train.graspnet import LAYERS, GraspNet, Loss
-from qsgm.train.local import LayerState, columns, layer_forward, true_gradients
-from qsgm.train.maml import MamlConfig, MetaTraining
-from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
-from qsgm.train.objects import draw_frame
-from qsgm.train.pretrain import FIRST_RATES, TUNED
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet, draw_tasks
+from qsgm.train.grasp.objects import draw_frame
+from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.model.local import LayerState, columns, layer_forward, true_gradients
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.paper.baselines.backpropagation import Backpropagation
+from qsgm.train.paper.baselines.tuning import Recipe, adam, run_baseline, sgd
+from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune, score
+from qsgm.train.pretraining.maml import MamlConfig, MetaTraining
+from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.pretraining.pretrain import FIRST_RATES, TUNED
+from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
 
 EPOCHS = (1, 3, 20)
 TASKS, CROPS, SEED = 240, 400, 21

@@ -29,10 +29,10 @@ from rich.table import Table
 
 from qsgm import QsgmError, Settings, load_bundle
 from qsgm.bundle import Bundle
-from qsgm.finetuning import train
+from qsgm.grasp.tuned import TunedObject
 from qsgm.images import read_frame
-from qsgm.preparing import prepare
-from qsgm.tuned import TunedObject
+from qsgm.tune.prepare import prepare
+from qsgm.tune.run import train
 
 RIGHT_SHARE = 0.27
 FALSE_ALARMS = 0.02

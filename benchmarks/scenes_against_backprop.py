@@ -23,7 +23,7 @@ from qsgm.bench.judging import Tally, paired_difference
 from qsgm.bench.scenes import MethodResults, ScenePlan, TunedMethod, measure_scenes
 from qsgm.bench.subjects import drawn_subjects, spread, subjects_of
 from qsgm.bundle import Bundle, Recipe, load_bundle
-from qsgm.settings import Settings
+from qsgm.tune.settings import Settings
 
 LENGTHS = (1, 3, 20)
 GRID = {"sgd": (0.003, 0.01, 0.03), "adam": (0.0003, 0.001, 0.003)}

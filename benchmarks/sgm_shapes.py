@@ -16,12 +16,12 @@ from rich.table import Table
 from torch.nn.functional import cosine_similarity
 
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.graspnet import LAYERS
-from qsgm.train.matching import Examples, MatchingConfig, fit_sgm, record_examples
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import draw_tasks
-from qsgm.tuning import BATCH
+from qsgm.train.model.graspnet import LAYERS
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.pretraining.matching import Examples, MatchingConfig, fit_sgm, record_examples
+from qsgm.train.pretraining.tasks import draw_tasks
+from qsgm.tune.loop import BATCH
 
 SHAPES = ((16,), (32,), (128,), (32, 32), (64, 64), (128, 128))
 MOVING = {"layers 5, 6 held still": (0.01, 0.0, 0.0), "all at one rate": (0.01, 0.01, 0.01)}

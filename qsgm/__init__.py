@@ -23,20 +23,20 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from qsgm.bundle import load_bundle
-    from qsgm.finetuning import finetune
     from qsgm.grasp.source import Demonstration
+    from qsgm.grasp.tuned import load_object
     from qsgm.images import read_frame
-    from qsgm.settings import Settings
-    from qsgm.tuned import load_object
+    from qsgm.tune.run import finetune
+    from qsgm.tune.settings import Settings
 else:
     # Imported when asked for, since they bring in ONNX Runtime and OpenCV. None of these modules
     # may have the name of an export: importing it would put the module in the export's place.
     _HOME = {
         "Demonstration": "qsgm.grasp.source",
-        "Settings": "qsgm.settings",
-        "finetune": "qsgm.finetuning",
+        "Settings": "qsgm.tune.settings",
+        "finetune": "qsgm.tune.run",
         "load_bundle": "qsgm.bundle",
-        "load_object": "qsgm.tuned",
+        "load_object": "qsgm.grasp.tuned",
         "read_frame": "qsgm.images",
     }
 

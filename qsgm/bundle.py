@@ -13,17 +13,17 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from qsgm import defaults
-from qsgm.angles import ENCODINGS, AngleEncoding
 from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.defaults import MOST_LAYERS
-from qsgm.distractors import FILE as DISTRACTORS
-from qsgm.distractors import Distractors, load_distractors
 from qsgm.errors import QsgmError
-from qsgm.folded import FoldedConv, FoldedSgm
+from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.decision import Decision
-from qsgm.quantize import ACTIVATION_BITS, LABELS, ActivationBits
+from qsgm.grasp.distractors import FILE as DISTRACTORS
+from qsgm.grasp.distractors import Distractors, load_distractors
 from qsgm.runtime import open_session
-from qsgm.tuning import short_run_factor
+from qsgm.sgm.float import FoldedConv, FoldedSgm
+from qsgm.sgm.int8 import ACTIVATION_BITS, LABELS, ActivationBits
+from qsgm.tune.loop import short_run_factor
 
 MANIFEST = "manifest.json"
 FORMAT = "qsgm-bundle"

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import CROP_PX
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
+from qsgm.grasp.crops import CROP_PX
 
 MAX_SIDE_PX = 4096
 MAX_FILE_BYTES = 200_000_000

@@ -18,22 +18,22 @@ from torch import nn
 from qsgm import bundle as bundles
 from qsgm.blocks import one_block, parse_blocks, single_layers, tuned_layers
 from qsgm.bundle import Bundle, load_bundle
-from qsgm.crops import cut_crops, plan_crops
-from qsgm.folded import FoldedSgm, float_trace
+from qsgm.grasp.crops import cut_crops, plan_crops
 from qsgm.images import write_png
-from qsgm.quantize import QuantizedSgm, SgmRanges, quantize_sgm
-from qsgm.train.calibration_set import Demonstration
-from qsgm.train.draw_distractors import encode_sheet
+from qsgm.sgm.float import FoldedSgm, float_trace
+from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, quantize_sgm
 from qsgm.train.export import build_trunks, bundle_files
-from qsgm.train.fold import FoldedNet, fold_net, fold_sgm
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model
-from qsgm.train.graspnet import CHANNELS, GraspNet, Loss, normalize
-from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
-from qsgm.train.sgm import Sgm
-from qsgm.train.trunk_ranges import calibration_crops, observe_crops
+from qsgm.train.grasp.draw_distractors import encode_sheet
+from qsgm.train.model.fold import FoldedNet, fold_net, fold_sgm
+from qsgm.train.model.graspnet import CHANNELS, GraspNet, Loss, normalize
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.quantization.calibration_set import Demonstration
+from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
+from qsgm.train.quantization.trunk_ranges import calibration_crops, observe_crops
 
 # Threads that wait for each other on a busy machine take longer than this work does.
 torch.set_num_threads(1)

@@ -2,7 +2,7 @@
 
 import torch
 
-from qsgm.train.graspnet import GraspNet
+from qsgm.train.model.graspnet import GraspNet
 
 
 def random_net(seed: int) -> GraspNet:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qsgm.angles import (
+from qsgm.grasp.angles import (
     AngleEncoding,
     angle_error,
     decode_angle,

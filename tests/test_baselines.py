@@ -8,15 +8,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.baselines.backpropagation import Backpropagation
-from qsgm.train.baselines.direct_feedback import DirectFeedbackAlignment
-from qsgm.train.baselines.feedback_alignment import FeedbackAlignment, random_feedback
-from qsgm.train.baselines.interface import Baseline, ForwardPass, forward_pass
-from qsgm.train.baselines.online_sgms import OnlineSgms, bootstrapped_target, true_target
-from qsgm.train.baselines.projections import random_projections
-from qsgm.train.baselines.static_sgms import LabelFreeSgm, StaticSgms
-from qsgm.train.baselines.target_projection import TargetProjection
-from qsgm.train.baselines.tuning import (
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.local import LayerState, local_step, loss_gradient, true_gradients
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.paper.baselines.backpropagation import Backpropagation
+from qsgm.train.paper.baselines.direct_feedback import DirectFeedbackAlignment
+from qsgm.train.paper.baselines.feedback_alignment import FeedbackAlignment, random_feedback
+from qsgm.train.paper.baselines.interface import Baseline, ForwardPass, forward_pass
+from qsgm.train.paper.baselines.online_sgms import OnlineSgms, bootstrapped_target, true_target
+from qsgm.train.paper.baselines.projections import random_projections
+from qsgm.train.paper.baselines.static_sgms import LabelFreeSgm, StaticSgms
+from qsgm.train.paper.baselines.target_projection import TargetProjection
+from qsgm.train.paper.baselines.tuning import (
     MakeOptimizer,
     Recipe,
     adam,
@@ -25,14 +29,10 @@ from qsgm.train.baselines.tuning import (
     sgd,
     tuned_states,
 )
-from qsgm.train.evaluate import score
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.local import LayerState, local_step, loss_gradient, true_gradients
-from qsgm.train.maml import apply_sgm
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet, shuffled_batches, start_states
-from qsgm.tuning import rate_factor
+from qsgm.train.pretraining.evaluate import score
+from qsgm.train.pretraining.maml import apply_sgm
+from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
+from qsgm.tune.loop import rate_factor
 from tests.nets import random_net
 
 TASKS, CROPS, SUPPORT = 2, 50, 40

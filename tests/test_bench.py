@@ -21,11 +21,11 @@ from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bench.speed import measure_speed, ratios
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, Recipe, load_bundle, step_file
-from qsgm.finetuning import finetune, train
 from qsgm.images import write_png
-from qsgm.preparing import prepare
-from qsgm.settings import Settings
-from qsgm.tuning import StepLoop, batches
+from qsgm.tune.loop import StepLoop, batches
+from qsgm.tune.prepare import prepare
+from qsgm.tune.run import finetune, train
+from qsgm.tune.settings import Settings
 
 SHORT = Settings(epochs=1)
 MAIN = Settings(precision="int8", epochs=2)

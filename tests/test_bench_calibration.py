@@ -35,14 +35,14 @@ from qsgm.bench.calibration import (
 )
 from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bundle import Bundle, load_bundle
-from qsgm.crops import TRAIN_CROPS
-from qsgm.finetuning import train
-from qsgm.folded import float_trace
-from qsgm.preparing import Prepared, prepare
-from qsgm.probing import activations_of, open_probe
-from qsgm.quantize import integer_forward, quantize_sgm
-from qsgm.settings import Settings
+from qsgm.grasp.crops import TRAIN_CROPS
+from qsgm.sgm.float import float_trace
+from qsgm.sgm.int8 import integer_forward, quantize_sgm
 from qsgm.train.calibration_chart import write_calibration_chart
+from qsgm.tune.prepare import Prepared, prepare
+from qsgm.tune.probe import activations_of, open_probe
+from qsgm.tune.run import train
+from qsgm.tune.settings import Settings
 from tests.conftest import draw_frame
 
 SHORT = Settings(precision="int8", epochs=1)

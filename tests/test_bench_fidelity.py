@@ -12,7 +12,7 @@ from qsgm import cli, finetune
 from qsgm.bench.fidelity import LEGEND, FidelityReport, measure_fidelity
 from qsgm.bench.frames import list_frames
 from qsgm.bundle import Bundle
-from qsgm.settings import Settings
+from qsgm.tune.settings import Settings
 
 SHORT = Settings(precision="int8", epochs=1)
 

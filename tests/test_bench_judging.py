@@ -43,7 +43,7 @@ from qsgm.bench.scenes_picture import Album, draw_scenes
 from qsgm.bench.scenes_report import ScenesReport
 from qsgm.bench.subjects import drawn_subjects, subjects_of
 from qsgm.cli.bench import SceneCondition
-from qsgm.settings import Settings
+from qsgm.tune.settings import Settings
 
 RIVALS = Path(__file__).parent.parent / "benchmarks" / "rivals"
 NOTHING = np.zeros((480, 640), bool)

@@ -24,8 +24,8 @@ from qsgm.bundle import (
     step_file,
     trunk_file,
 )
-from qsgm.finetuning import finetune
-from qsgm.settings import Settings
+from qsgm.tune.run import finetune
+from qsgm.tune.settings import Settings
 
 BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", "4,5-6", "1-4,5,6"]
 STEP = step_file("float", "sgd", single_layers(3))

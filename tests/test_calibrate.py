@@ -17,12 +17,20 @@ from qsgm import QsgmError
 from qsgm.blocks import single_layers
 from qsgm.cli.options import CalibratorName
 from qsgm.files import check_replaceable
-from qsgm.folded import FloatArray, float_trace
 from qsgm.images import read_frame, write_png
-from qsgm.observers import CALIBRATORS, Observer, Span
-from qsgm.quantize import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
-from qsgm.train import calibration_runs, export_report
-from qsgm.train.calibrate import (
+from qsgm.sgm.float import FloatArray, float_trace
+from qsgm.sgm.int8 import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
+from qsgm.sgm.ranges import CALIBRATORS, Observer, Span
+from qsgm.train import export_report
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.grasp.draw_calibration import draw_calibration_set
+from qsgm.train.grasp.draw_demo import draw_demo
+from qsgm.train.grasp.objects import TABLE_KINDS
+from qsgm.train.model.fold import fold_sgm, run_folded_sgm
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.quantization import calibration_runs
+from qsgm.train.quantization.calibrate import (
     AUTO,
     Calibration,
     best_calibrator,
@@ -30,7 +38,7 @@ from qsgm.train.calibrate import (
     held_out_frames,
     observe_frame,
 )
-from qsgm.train.calibration_runs import (
+from qsgm.train.quantization.calibration_runs import (
     RunPlan,
     Trainee,
     prepare,
@@ -38,15 +46,8 @@ from qsgm.train.calibration_runs import (
     run_plans,
     torch_product,
 )
-from qsgm.train.calibration_set import CalibrationSet
-from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.draw_calibration import draw_calibration_set
-from qsgm.train.draw_demo import draw_demo
-from qsgm.train.fold import fold_sgm, run_folded_sgm
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.objects import TABLE_KINDS
-from qsgm.train.sgm import Sgm
-from qsgm.train.sgm_fidelity import measure
+from qsgm.train.quantization.calibration_set import CalibrationSet
+from qsgm.train.quantization.sgm_fidelity import measure
 
 RATES = {str(single_layers(tuned)): (1e-3,) * tuned for tuned in (1, 2, 3)}
 EPOCHS = 1

@@ -14,8 +14,8 @@ from qsgm import cli
 from qsgm.bench.accuracy import AccuracyReport, Runs, curve_steps, groups_of
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle, Recipe
-from qsgm.settings import Settings
 from qsgm.train.charts import LINE_HEIGHT, learning_curves, write_learning_curves
+from qsgm.tune.settings import Settings
 
 Floats = NDArray[np.float64]
 

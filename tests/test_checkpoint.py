@@ -12,8 +12,8 @@ import torch
 from qsgm.errors import QsgmError
 from qsgm.train import checkpoint as module
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.sgm import Sgm
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.sgm import Sgm
 
 
 @pytest.fixture

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from toys import by_correlation, lay, table, toy
 
-from qsgm import __version__, cli, finetuning, paths
+from qsgm import __version__, cli, paths
 from qsgm.bundle import NETWORK, trunk_file
 from qsgm.cli import commands, console
 from qsgm.errors import QsgmError
-from qsgm.settings import Settings
+from qsgm.tune import run as finetuning
+from qsgm.tune.settings import Settings
 
 FINETUNE_KEYS = {
     "object",
@@ -687,7 +688,7 @@ def test_drawing_a_calibration_set_prints_one_json_object(qsgm: Run, tmp_path: P
 def test_pretrain_passes_on_encoding_and_hidden_channels(
     qsgm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from qsgm.train import pretrain
+    from qsgm.train.pretraining import pretrain
 
     given = []
     monkeypatch.setattr(pretrain, "pretrain", lambda *_, **keywords: given.append(keywords))

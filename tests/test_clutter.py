@@ -8,8 +8,10 @@ import pytest
 from conftest import draw_things
 from numpy.typing import NDArray
 
-from qsgm.crops import CROP_PX, cut_crops, plan_crops
-from qsgm.distractors import (
+from qsgm.grasp import clutter
+from qsgm.grasp.clutter import Addition, plan_clutter
+from qsgm.grasp.crops import CROP_PX, cut_crops, plan_crops
+from qsgm.grasp.distractors import (
     TILE_PX,
     Distractors,
     load_distractors,
@@ -17,10 +19,8 @@ from qsgm.distractors import (
     paste_planned,
     with_named,
 )
-from qsgm.grasp import clutter
-from qsgm.grasp.clutter import Addition, plan_clutter
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
-from qsgm.train.draw_distractors import encode_sheet
+from qsgm.train.grasp.draw_distractors import encode_sheet
 
 MANY = 20_000
 Frame = NDArray[np.uint8]

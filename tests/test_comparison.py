@@ -10,14 +10,14 @@ from nets import random_net
 from qsgm import cli
 from qsgm.bench.frames import list_frames
 from qsgm.train.baselines import comparison
-from qsgm.train.baselines.backpropagation import Backpropagation
 from qsgm.train.baselines.comparison import GRID, all_systems, compare, tasks_of
-from qsgm.train.baselines.tuning import Recipe, run_baseline
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.graspnet import Loss
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.paper.baselines.backpropagation import Backpropagation
+from qsgm.train.paper.baselines.tuning import Recipe, run_baseline
+from qsgm.train.pretraining.tasks import TaskSet
 
 
 @pytest.fixture(scope="module")

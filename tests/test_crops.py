@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from qsgm.angles import angle_error, decode_angle
-from qsgm.crops import (
+from qsgm.errors import QsgmError
+from qsgm.grasp.angles import angle_error, decode_angle
+from qsgm.grasp.crops import (
     CROP_PX,
     HALF_CROP_PX,
     NEGATIVE_DISTANCE_PX,
@@ -23,7 +24,6 @@ from qsgm.crops import (
     plan_crops,
     widened,
 )
-from qsgm.errors import QsgmError
 
 FRAME_HW = (480, 640)
 CENTER = (320.0, 240.0)

@@ -2,8 +2,8 @@
 
 import torch
 
-from qsgm.train.curvature import Curvature
-from qsgm.train.local import LayerState, local_step
+from qsgm.train.model.curvature import Curvature
+from qsgm.train.model.local import LayerState, local_step
 
 
 def random_curvature(layer: int, seed: int = 0) -> Curvature:

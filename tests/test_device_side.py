@@ -55,15 +55,15 @@ def brought_in(modules: list[str], banned: tuple[str, ...] = HOST_ONLY) -> dict[
 
 def test_no_device_module_imports_a_host_library() -> None:
     modules = device_modules()
-    assert {"qsgm", "qsgm.crops", "qsgm.predict"} <= set(modules)
+    assert {"qsgm", "qsgm.grasp.crops", "qsgm.grasp.heatmap"} <= set(modules)
     report = brought_in(modules)
     assert list(report) == modules
     assert {module: names for module, names in report.items() if names} == {}
 
 
 def test_the_probe_sees_an_import_that_is_not_direct() -> None:
-    # qsgm.predict reaches OpenCV only through qsgm.crops.
-    assert brought_in(["qsgm.predict"], ("cv2",)) == {"qsgm.predict": ["cv2"]}
+    # qsgm.grasp.heatmap reaches OpenCV only through qsgm.grasp.crops.
+    assert brought_in(["qsgm.grasp.heatmap"], ("cv2",)) == {"qsgm.grasp.heatmap": ["cv2"]}
 
 
 def test_no_device_module_imports_a_host_library_even_inside_a_function() -> None:
@@ -86,9 +86,9 @@ def test_the_command_line_starts_without_onnx_runtime_and_opencv() -> None:
 
 
 def test_every_export_is_what_it_says_even_after_its_module_was_imported() -> None:
-    import qsgm.finetuning
+    import qsgm.tune.run
 
-    assert qsgm.finetune is qsgm.finetuning.finetune
+    assert qsgm.finetune is qsgm.tune.run.finetune
     assert all(getattr(qsgm, name) is not None for name in qsgm.__all__)
     assert not any((Path(qsgm.__file__).parent / f"{name}.py").exists() for name in qsgm.__all__)
     with pytest.raises(AttributeError, match="'qsgm' has no attribute 'nothing'"):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm.distractors import (
+from qsgm.errors import QsgmError
+from qsgm.grasp.distractors import (
     GRAIN,
     Distractors,
     EdgePlan,
@@ -20,9 +21,8 @@ from qsgm.distractors import (
     plan_edges,
     plan_pastes,
 )
-from qsgm.errors import QsgmError
-from qsgm.train.draw_distractors import distractor_file, draw_sheet, encode_sheet
-from qsgm.train.drawing.shapes import OBJECT_KINDS
+from qsgm.train.grasp.draw_distractors import distractor_file, draw_sheet, encode_sheet
+from qsgm.train.grasp.drawing.shapes import OBJECT_KINDS
 
 NOTHING = np.array([256, 256, 256], np.int32)
 

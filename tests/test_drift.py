@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import pytest
 
-from qsgm.drift import LEAST_COSINE, NOTABLE_CLIPPING, NOTABLE_UNDERFLOW, drift_warnings
 from qsgm.fidelity import LayerFidelity
+from qsgm.tune.drift import LEAST_COSINE, NOTABLE_CLIPPING, NOTABLE_UNDERFLOW, drift_warnings
 
 GOOD = LayerFidelity(
     **{one.name: 0.0 for one in fields(LayerFidelity) if not one.name.startswith("cos")},

@@ -5,12 +5,14 @@ import torch
 from nets import random_net
 from torch.nn import functional as F
 
-from qsgm.train.curvature import FLAT
-from qsgm.train.early import EarlyConfig, EarlyMatching, behind
-from qsgm.train.evaluate import Score, UpdateRule
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.local import outputs
-from qsgm.train.rates import (
+from qsgm.train.model.curvature import FLAT
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.local import outputs
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.pretraining.evaluate import Score, UpdateRule
+from qsgm.train.pretraining.map_sgms import EarlyConfig, EarlyMatching, behind
+from qsgm.train.pretraining.rates import (
     EARLY_RATE_GRID,
     SHORT_GAINS,
     RatesConfig,
@@ -19,9 +21,7 @@ from qsgm.train.rates import (
     choose_short_gain,
     late_candidates,
 )
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet, draw_tasks, start_states
+from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, start_states
 
 CONFIG = EarlyConfig(
     tasks=2, crops_per_task=20, epochs=2, looks=(1, 2), steps=40, tasks_per_step=2, crops_per_step=4

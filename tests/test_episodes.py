@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from qsgm.grasp.evidence import NAMES
-from qsgm.train.decision import DecisionConfig, JudgedScene, best_score, fit_decision
-from qsgm.train.decision_scenes import heatmap_of
-from qsgm.train.episodes import USUAL, EpisodeMaker
-from qsgm.train.graspnet import GraspNet, Loss, normalize
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import start_states
+from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, best_score, fit_decision
+from qsgm.train.grasp.decision_scenes import heatmap_of
+from qsgm.train.grasp.episodes import USUAL, EpisodeMaker
+from qsgm.train.model.graspnet import GraspNet, Loss, normalize
+from qsgm.train.model.start import folded_start
+from qsgm.train.pretraining.tasks import start_states
 
 
 @pytest.fixture(scope="module")

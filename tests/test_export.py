@@ -17,20 +17,21 @@ from toys import by_correlation
 from qsgm import QsgmError
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import NETWORK, Bundle, Recipe, load_bundle
-from qsgm.train import calibration_runs, export
-from qsgm.train.calibration_set import CalibrationSet
+from qsgm.grasp.tuned import ObjectDescription, save_object
+from qsgm.train import export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.draw_calibration import draw_calibration_set
-from qsgm.train.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.export import fold_and_quantize
 from qsgm.train.export_report import ExportReport
-from qsgm.train.fold import fold_net
 from qsgm.train.graphs.inspection import refuse_float_products
-from qsgm.train.graspnet import GraspNet, Loss
+from qsgm.train.grasp.draw_calibration import draw_calibration_set
+from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.liveness import step_memory
-from qsgm.train.sgm import Sgm
-from qsgm.tuned import ObjectDescription, save_object
-from qsgm.tuning import BATCH, StepLoop
+from qsgm.train.model.fold import fold_net
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.quantization import calibration_runs
+from qsgm.train.quantization.calibration_set import CalibrationSet
+from qsgm.tune.loop import BATCH, StepLoop
 from qsgm.weights import to_step_layout
 
 RATES = {"6": (4e-3,), "5,6": (2e-3, 3e-3), "4,5,6": (1e-3, 2e-3, 3e-3)}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch.nn import functional as F
 
-from qsgm import QsgmError, defaults, probing
+from qsgm import QsgmError, defaults
 from qsgm.bundle import MANIFEST, Bundle, load_bundle, probe_file
 from qsgm.fidelity import (
     PROBED,
@@ -32,13 +32,14 @@ from qsgm.fidelity import (
     sqnr_db,
     weighted_error,
 )
-from qsgm.finetuning import FinetuneResult, finetune, train
-from qsgm.preparing import STEPS_PER_EPOCH, prepare
-from qsgm.report import fidelity_command_json, fidelity_command_report
-from qsgm.settings import Settings
-from qsgm.train.local import LayerState, columns, layer_forward
-from qsgm.train.sgm_fidelity import update_from
-from qsgm.tuning import BATCH
+from qsgm.train.model.local import LayerState, columns, layer_forward
+from qsgm.train.quantization.sgm_fidelity import update_from
+from qsgm.tune import probe as probing
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import STEPS_PER_EPOCH, prepare
+from qsgm.tune.report import fidelity_command_json, fidelity_command_report
+from qsgm.tune.run import FinetuneResult, finetune, train
+from qsgm.tune.settings import Settings
 
 RNG = np.random.default_rng(0)
 GRADIENT = RNG.normal(size=(32, 16)).astype(np.float32)

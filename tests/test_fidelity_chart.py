@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 
 from qsgm import cli
 from qsgm.bundle import MANIFEST, Bundle, probe_file
-from qsgm.finetuning import FinetuneResult, finetune
-from qsgm.probing import Probe
-from qsgm.settings import Settings
 from qsgm.train.fidelity_chart import (
     DOTS,
     LABEL_GAP,
@@ -26,6 +23,9 @@ from qsgm.train.fidelity_chart import (
     running_mean,
     write_fidelity_chart,
 )
+from qsgm.tune.probe import Probe
+from qsgm.tune.run import FinetuneResult, finetune
+from qsgm.tune.settings import Settings
 
 PANELS = [panel for row in ROWS for panel in row.panels]
 

@@ -13,20 +13,23 @@ import pytest
 from numpy.typing import NDArray
 from toys import bump, by_correlation, lay, table, toy
 
-from qsgm import QsgmError, finetune, finetuning, load_bundle, load_object, preparing, probing
-from qsgm.angles import encode_angle
+from qsgm import QsgmError, finetune, load_bundle, load_object
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, Precision, head_file
-from qsgm.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
-from qsgm.finetuning import FinetuneResult, peak_activation_bytes, train
+from qsgm.grasp.angles import encode_angle
+from qsgm.grasp.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
 from qsgm.grasp.others import other_in
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
-from qsgm.preparing import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
-from qsgm.quantize import SgmRanges, constants, quantize_sgm
-from qsgm.report import finetune_json, to_json
-from qsgm.settings import Settings
-from qsgm.tuned import MARGIN_PX
-from qsgm.tuning import BATCH
+from qsgm.grasp.tuned import MARGIN_PX
+from qsgm.sgm.int8 import SgmRanges, constants, quantize_sgm
+from qsgm.tune import prepare as preparing
+from qsgm.tune import probe as probing
+from qsgm.tune import run as finetuning
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
+from qsgm.tune.report import finetune_json, to_json
+from qsgm.tune.run import FinetuneResult, peak_activation_bytes, train
+from qsgm.tune.settings import Settings
 from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]

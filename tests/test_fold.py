@@ -7,7 +7,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from qsgm import QsgmError
-from qsgm.train.fold import (
+from qsgm.train.model.fold import (
     fold_net,
     fold_sgm,
     net_fold_error,
@@ -15,8 +15,8 @@ from qsgm.train.fold import (
     run_folded,
     sgm_fold_error,
 )
-from qsgm.train.graspnet import CHANNELS, GraspNet, normalize
-from qsgm.train.sgm import Sgm
+from qsgm.train.model.graspnet import CHANNELS, GraspNet, normalize
+from qsgm.train.model.sgm import Sgm
 
 
 def shake_norms(module: nn.Module, seed: int) -> None:

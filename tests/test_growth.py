@@ -37,9 +37,9 @@ from qsgm.bench.growth import (
 )
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, step_file
-from qsgm.folded import float_trace
-from qsgm.quantize import ActivationBits, integer_forward
 from qsgm.runtime import session_options
+from qsgm.sgm.float import float_trace
+from qsgm.sgm.int8 import ActivationBits, integer_forward
 from qsgm.train import growth
 from qsgm.train.graphs.inspection import integer_operators, refuse_float_products
 from qsgm.train.graphs.trunk import int8_trunk_model

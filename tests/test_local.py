@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.graspnet import Loss
-from qsgm.train.local import LayerState, local_step, loss_gradient, outputs, true_gradients
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.local import LayerState, local_step, loss_gradient, outputs, true_gradients
 
 TASKS, BATCH = 3, 5
 SHAPES = {

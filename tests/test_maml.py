@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qsgm.train.graspnet import Loss
-from qsgm.train.maml import MamlConfig, MetaTraining, Run, _Unrolled, apply_sgm
-from qsgm.train.sgm import Sgm
-from qsgm.train.tasks import TaskSet
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, Run, _Unrolled, apply_sgm
+from qsgm.train.pretraining.tasks import TaskSet
 
 CONFIG = MamlConfig(
     outer_steps=8,

@@ -31,10 +31,10 @@ from qsgm.bench.resident import peak_resident_bytes
 from qsgm.bench.speed import TORCH
 from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle, Precision, load_bundle
-from qsgm.finetuning import finetune
 from qsgm.images import read_frame
-from qsgm.settings import Settings
 from qsgm.train.memory_chart import caption, in_units, memory_chart, write_memory_chart
+from qsgm.tune.run import finetune
+from qsgm.tune.settings import Settings
 
 MB = 1_000_000
 

@@ -8,11 +8,11 @@ import torch
 from nets import random_net
 
 from qsgm import QsgmError
-from qsgm.angles import AngleEncoding
-from qsgm.train.fold import FoldedNet, fold_net
+from qsgm.grasp.angles import AngleEncoding
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
-from qsgm.train.graspnet import GraspNet, Loss, normalize
+from qsgm.train.model.fold import FoldedNet, fold_net
+from qsgm.train.model.graspnet import GraspNet, Loss, normalize
 from qsgm.weights import to_conv_layout, to_step_layout
 
 

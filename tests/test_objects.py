@@ -2,12 +2,12 @@ import cv2
 import numpy as np
 import pytest
 
-from qsgm.angles import angle_error
 from qsgm.errors import QsgmError
-from qsgm.train.drawing.parts import Part, box
-from qsgm.train.drawing.render import Light, fitted, render
-from qsgm.train.drawing.shapes import COMPACT, ELONGATED
-from qsgm.train.objects import OBJECT_KINDS, TABLE_KINDS, DrawnFrame, draw_frame
+from qsgm.grasp.angles import angle_error
+from qsgm.train.grasp.drawing.parts import Part, box
+from qsgm.train.grasp.drawing.render import Light, fitted, render
+from qsgm.train.grasp.drawing.shapes import COMPACT, ELONGATED
+from qsgm.train.grasp.objects import OBJECT_KINDS, TABLE_KINDS, DrawnFrame, draw_frame
 
 
 def drawn(seed: int, **kinds: str) -> DrawnFrame:

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from qsgm import QsgmError
-from qsgm.folded import FloatArray, FoldedConv, FoldedSgm
-from qsgm.observers import (
+from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm
+from qsgm.sgm.ranges import (
     BINS,
     CALIBRATORS,
     ENTROPY_CLIPS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from toys import lay, table, toy
 
-from qsgm.distractors import TILE_PX, Distractors
+from qsgm.grasp.distractors import TILE_PX, Distractors
 from qsgm.grasp.others import Other, add_others, other_in
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.source import Demonstration

@@ -13,8 +13,9 @@ from rich.console import Console
 from torch import nn
 
 from qsgm import cli
-from qsgm.crops import plan_crops
-from qsgm.train.graspnet import GraspNet, normalize
+from qsgm.grasp.crops import plan_crops
+from qsgm.train.model.graspnet import GraspNet, normalize
+from qsgm.train.model.sgm import Sgm, SgmLayer
 from qsgm.train.paper import experiment, objects, report, systems
 from qsgm.train.paper.driven import (
     FixedSgms,
@@ -29,7 +30,6 @@ from qsgm.train.paper.objects import OBJECTS, PAPER_LOSS, ObjectCrops, contact_s
 from qsgm.train.paper.pretraining import Pretrained, PretrainingSizes, pretrain_without
 from qsgm.train.paper.published import SEVENTH_OBJECT, TABLE_1, TABLE_2
 from qsgm.train.paper.systems import ADAM, BATCHNORM, task_of
-from qsgm.train.sgm import Sgm, SgmLayer
 from tests.nets import random_net
 
 SIZES = PretrainingSizes(2, 2, 1, 4)

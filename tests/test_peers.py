@@ -31,12 +31,12 @@ from qsgm.bench.peers_table import (
 from qsgm.bench.speed import peer_ratios
 from qsgm.bundle import Bundle
 from qsgm.images import read_demonstration
-from qsgm.preparing import prepare
-from qsgm.settings import Settings
-from qsgm.train.graspnet import Loss
+from qsgm.train.model.graspnet import Loss
 from qsgm.train.peers import step_data as job
 from qsgm.train.peers.ort_training_steps import loss_model, weight_names
 from qsgm.train.peers.torch_steps import ExportedNet, Net, eager_step, timed_steps
+from qsgm.tune.prepare import prepare
+from qsgm.tune.settings import Settings
 from qsgm.weights import to_step_layout
 
 STEPS = job.CHECKED_STEPS + 5

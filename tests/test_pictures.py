@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm.pictures import _values, draw_detection
-from qsgm.predict import Detection
+from qsgm.grasp.heatmap import Detection
+from qsgm.grasp.pictures import _values, draw_detection
 
 FRAME = np.full((480, 640, 3), 128, dtype=np.uint8)
 NOTHING = np.zeros((3, 23, 33), dtype=np.float32)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.console import Console
 
-from qsgm.angles import AngleEncoding, angle_error, encode_angle
 from qsgm.errors import QsgmError
-from qsgm.pictures import _values
-from qsgm.predict import Detection, locate, refine
-from qsgm.report import detection_table, fidelity_table, plain_table, predict_json
+from qsgm.grasp.angles import AngleEncoding, angle_error, encode_angle
+from qsgm.grasp.heatmap import Detection, locate, refine
+from qsgm.grasp.pictures import _values
+from qsgm.tune.report import detection_table, fidelity_table, plain_table, predict_json
 
 FRAME_HW = (480, 640)
 ROWS_COLS = (23, 33)

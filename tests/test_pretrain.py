@@ -9,21 +9,21 @@ import torch
 
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
-from qsgm.train import partial as partial_module
-from qsgm.train import pretrain as module
-from qsgm.train import rates as rates_module
-from qsgm.train.backbone import BackboneConfig
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.decision import DecisionConfig
-from qsgm.train.decision_scenes import DecisionScenesConfig
-from qsgm.train.early import EarlyConfig
-from qsgm.train.evaluate import Score
-from qsgm.train.graspnet import Loss
-from qsgm.train.maml import MamlConfig, MetaTraining
-from qsgm.train.matching import MatchingConfig
-from qsgm.train.partial import Partial
-from qsgm.train.pretrain import PretrainConfig, pretrain
-from qsgm.train.rates import RatesConfig
+from qsgm.train.grasp.decision import DecisionConfig
+from qsgm.train.grasp.decision_scenes import DecisionScenesConfig
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.pretraining import pretrain as module
+from qsgm.train.pretraining import rates as rates_module
+from qsgm.train.pretraining import resume as partial_module
+from qsgm.train.pretraining.backbone import BackboneConfig
+from qsgm.train.pretraining.evaluate import Score
+from qsgm.train.pretraining.maml import MamlConfig, MetaTraining
+from qsgm.train.pretraining.map_sgms import EarlyConfig
+from qsgm.train.pretraining.matching import MatchingConfig
+from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
+from qsgm.train.pretraining.rates import RatesConfig
+from qsgm.train.pretraining.resume import Partial
 
 TINY = PretrainConfig(
     hidden=(8,),

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from qsgm import QsgmError
-from qsgm.folded import FloatArray, FoldedConv, FoldedSgm
-from qsgm.quantize import (
+from qsgm.runtime import session_options
+from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm
+from qsgm.sgm.int8 import (
     ACTIVATION_BITS,
     ActivationBits,
     QuantizedSgm,
@@ -27,7 +28,6 @@ from qsgm.quantize import (
     underflow_fraction,
     with_zero,
 )
-from qsgm.runtime import session_options
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import (
     integer_operators,

@@ -13,11 +13,9 @@ from qsgm import QsgmError, cli
 from qsgm.blocks import parse_blocks
 from qsgm.bundle import Bundle, probe_file
 from qsgm.fidelity import cosine
-from qsgm.finetuning import train
-from qsgm.folded import FloatArray, FoldedConv, FoldedSgm, float_trace
-from qsgm.preparing import prepare
-from qsgm.probing import activations_before, constants_of
-from qsgm.quantize import (
+from qsgm.runtime import open_session
+from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_trace
+from qsgm.sgm.int8 import (
     QuantizedSgm,
     SgmRanges,
     constants,
@@ -25,12 +23,14 @@ from qsgm.quantize import (
     integer_forward,
     quantize_sgm,
 )
-from qsgm.recalibration import ANY_LABEL, grown, ranges_of, recalibrated
-from qsgm.runtime import open_session
-from qsgm.settings import Settings
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.sgm import int8_sgm
 from qsgm.train.graphs.sharing import SharedConstants
+from qsgm.tune.prepare import prepare
+from qsgm.tune.probe import activations_before, constants_of
+from qsgm.tune.recalibrate import ANY_LABEL, grown, ranges_of, recalibrated
+from qsgm.tune.run import train
+from qsgm.tune.settings import Settings
 from tests.conftest import draw_frame
 
 KERNELS = pytest.mark.parametrize(("kernel", "side"), [(1, 1), (3, 4)], ids=["1x1", "3x3"])

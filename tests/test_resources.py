@@ -26,12 +26,12 @@ from qsgm.bench.shapes import STRIDES, layer_shapes, output_bytes
 from qsgm.bench.step_jobs import step_job
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle
-from qsgm.folded import FoldedConv, FoldedSgm, float_trace
-from qsgm.quantize import ActivationBits, SgmRanges, constants, quantize_sgm
-from qsgm.train import graspnet
-from qsgm.train.fold import run_folded_sgm
-from qsgm.train.sgm import Sgm
-from qsgm.tuning import BATCH
+from qsgm.sgm.float import FoldedConv, FoldedSgm, float_trace
+from qsgm.sgm.int8 import ActivationBits, SgmRanges, constants, quantize_sgm
+from qsgm.train.model import graspnet
+from qsgm.train.model.fold import run_folded_sgm
+from qsgm.train.model.sgm import Sgm
+from qsgm.tune.loop import BATCH
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from qsgm.angles import angle_error
 from qsgm.errors import QsgmError
-from qsgm.train.drawing.scenes import (
+from qsgm.grasp.angles import angle_error
+from qsgm.train.grasp.drawing.scenes import (
     DrawnObject,
     DrawnScene,
     View,
@@ -13,8 +13,8 @@ from qsgm.train.drawing.scenes import (
     draw_scene,
     in_colours_of,
 )
-from qsgm.train.drawing.shapes import OBJECT_KINDS
-from qsgm.train.drawing.structures import STRUCTURE_KINDS
+from qsgm.train.grasp.drawing.shapes import OBJECT_KINDS
+from qsgm.train.grasp.drawing.structures import STRUCTURE_KINDS
 
 TABLE = np.full((480, 640, 3), 150, np.uint8)
 

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.train.graspnet import CHANNELS
-from qsgm.train.local import LayerState, local_step
-from qsgm.train.sgm import SGM_LAYERS, Sgm, SgmLayer, Teacher
+from qsgm.train.model.graspnet import CHANNELS
+from qsgm.train.model.local import LayerState, local_step
+from qsgm.train.model.sgm import SGM_LAYERS, Sgm, SgmLayer, Teacher
 
 BATCH, LAYER = 6, 5
 

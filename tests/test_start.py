@@ -5,10 +5,10 @@ import copy
 import torch
 from nets import random_net
 
-from qsgm.train.graspnet import Loss
-from qsgm.train.local import outputs
-from qsgm.train.start import folded_start, write_back
-from qsgm.train.tasks import start_states
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.local import outputs
+from qsgm.train.model.start import folded_start, write_back
+from qsgm.train.pretraining.tasks import start_states
 
 
 @torch.no_grad()

@@ -24,10 +24,8 @@ from torch.nn import functional as F
 
 from qsgm import QsgmError
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
-from qsgm.folded import FoldedConv, FoldedSgm
-from qsgm.quantize import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
-from qsgm.train.curvature import FLAT, Curvature
-from qsgm.train.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv, run_folded_sgm
+from qsgm.sgm.float import FoldedConv, FoldedSgm
+from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import (
     all_nodes,
@@ -38,9 +36,11 @@ from qsgm.train.graphs.layers import is_positive
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
-from qsgm.train.graspnet import Loss
-from qsgm.train.sgm import Sgm
-from qsgm.tuning import StepLoop
+from qsgm.train.model.curvature import FLAT, Curvature
+from qsgm.train.model.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv, run_folded_sgm
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.tune.loop import StepLoop
 from qsgm.weights import to_step_layout
 
 CROPS, BATCH = 37, 8

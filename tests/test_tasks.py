@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from qsgm.angles import AngleEncoding, angle_error, decode_angle, encode_angle
-from qsgm.crops import label_crops, plan_crops
 from qsgm.errors import QsgmError
-from qsgm.train.backbone import BackboneConfig, BackboneTraining
-from qsgm.train.evaluate import Score, best_rates, score
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.local import true_gradients
-from qsgm.train.matching import MatchingConfig, fit_sgm, record_examples
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import CropStream, TaskSet, axis_offset, draw_tasks, start_states
+from qsgm.grasp.angles import AngleEncoding, angle_error, decode_angle, encode_angle
+from qsgm.grasp.crops import label_crops, plan_crops
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.local import true_gradients
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.pretraining.backbone import BackboneConfig, BackboneTraining
+from qsgm.train.pretraining.evaluate import Score, best_rates, score
+from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.pretraining.tasks import CropStream, TaskSet, axis_offset, draw_tasks, start_states
 
 
 def raw_for(angle_rad: np.ndarray, quality: np.ndarray) -> torch.Tensor:

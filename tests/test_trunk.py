@@ -16,12 +16,8 @@ from nets import random_net
 
 from qsgm import QsgmError
 from qsgm.blocks import one_block, single_layers
-from qsgm.folded import FloatArray
 from qsgm.runtime import session_options
-from qsgm.train import trunk_ranges
-from qsgm.train.calibration_set import CalibrationSet, Demonstration
-from qsgm.train.draw_calibration import draw_calibration_set
-from qsgm.train.fold import FoldedLayer, FoldedNet, fold_net, fold_sgm
+from qsgm.sgm.float import FloatArray
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import (
     integer_operators,
@@ -32,8 +28,13 @@ from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.step import step_model
 from qsgm.train.graphs.trunk import int8_layer, int8_trunk_model, trunk_model
-from qsgm.train.graspnet import Loss, normalize
-from qsgm.train.quantize_trunk import (
+from qsgm.train.grasp.draw_calibration import draw_calibration_set
+from qsgm.train.model.fold import FoldedLayer, FoldedNet, fold_net, fold_sgm
+from qsgm.train.model.graspnet import Loss, normalize
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.quantization import trunk_ranges
+from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration
+from qsgm.train.quantization.trunk import (
     HEADROOM,
     LayerRange,
     QuantizedLayer,
@@ -41,8 +42,12 @@ from qsgm.train.quantize_trunk import (
     quantize_trunk,
     u8_steps,
 )
-from qsgm.train.sgm import Sgm
-from qsgm.train.trunk_ranges import calibration_crops, join, observe_crops, observe_trunk
+from qsgm.train.quantization.trunk_ranges import (
+    calibration_crops,
+    join,
+    observe_crops,
+    observe_trunk,
+)
 from qsgm.weights import to_step_layout
 
 ALL, NONE = ort.GraphOptimizationLevel.ORT_ENABLE_ALL, ort.GraphOptimizationLevel.ORT_DISABLE_ALL

@@ -13,10 +13,17 @@ from toys import bump, by_correlation, lay, table, toy
 from qsgm import QsgmError, load_object
 from qsgm.bundle import NETWORK, Bundle
 from qsgm.grasp.decision import Decision
+from qsgm.grasp.heatmap import Detection, Place, locate, refine
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
-from qsgm.predict import Detection, Place, locate, refine
-from qsgm.tuned import DESCRIPTION, MARGIN_PX, REPORT, ObjectDescription, TunedObject, save_object
+from qsgm.grasp.tuned import (
+    DESCRIPTION,
+    MARGIN_PX,
+    REPORT,
+    ObjectDescription,
+    TunedObject,
+    save_object,
+)
 
 Point = tuple[float, float]
 MUG = ObjectDescription("mug", "double", 0.25)

@@ -9,8 +9,8 @@ from toys import SIDE, lay, table, toy
 
 from qsgm.grasp.likeness import Likeness, likeness_of
 from qsgm.grasp.patch import Patch, cut_patch
-from qsgm.preparing import Accuracy
-from qsgm.verdict import Verdict, verdict_on
+from qsgm.grasp.verdict import Verdict, verdict_on
+from qsgm.tune.prepare import Accuracy
 
 GOOD = Accuracy(0.99, 1.5, 0.995, 1.4, 0.97)
 UNTOUCHED = Accuracy(0.8, 5.0, 0.95, 3.0, 0.6)

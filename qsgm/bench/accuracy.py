@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle, Method, OptimizerName, Precision, Recipe
-from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import train
-from qsgm.preparing import Prepared, Watch, prepare, validate
-from qsgm.settings import Settings
-from qsgm.tuning import BATCH
+from qsgm.grasp.crops import TRAIN_CROPS
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Prepared, Watch, prepare, validate
+from qsgm.tune.run import train
+from qsgm.tune.settings import Settings
 
 Floats = NDArray[np.float64]
 

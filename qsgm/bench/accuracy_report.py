@@ -18,8 +18,8 @@ from qsgm.bench.accuracy import (
     Runs,
 )
 from qsgm.bundle import Recipe
-from qsgm.report import number, plain_table
-from qsgm.settings import trunk_precision
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.settings import trunk_precision
 
 LEGEND = """means over frames after so many epochs (ep.); then the longest run's median and
 spread (standard deviation); angle: error in degrees, modulo 180°

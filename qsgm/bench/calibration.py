@@ -21,14 +21,10 @@ from rich.text import Text
 from qsgm.bench.frames import MANIFEST, BenchFrame, list_frames
 from qsgm.blocks import tuned_layers
 from qsgm.bundle import Bundle
-from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.finetuning import FinetuneResult, train
-from qsgm.folded import FloatArray, float_trace
-from qsgm.observers import CALIBRATORS, SgmObservers
-from qsgm.preparing import Prepared, Watch, prepare
-from qsgm.probing import Exchanged, activations_before, activations_of, open_probe
-from qsgm.quantize import (
+from qsgm.grasp.crops import TRAIN_CROPS
+from qsgm.sgm.float import FloatArray, float_trace
+from qsgm.sgm.int8 import (
     ACTIVATION_BITS,
     WEIGHT_BITS,
     ActivationBits,
@@ -38,10 +34,14 @@ from qsgm.quantize import (
     constants_of_two_planes,
     quantize_sgm,
 )
-from qsgm.recalibration import GROWTH, grown, ranges_of
-from qsgm.report import number, plain_table
-from qsgm.settings import Settings, sgm_blocks
-from qsgm.tuning import BATCH
+from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Prepared, Watch, prepare
+from qsgm.tune.probe import Exchanged, activations_before, activations_of, open_probe
+from qsgm.tune.recalibrate import GROWTH, grown, ranges_of
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.run import FinetuneResult, train
+from qsgm.tune.settings import Settings, sgm_blocks
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

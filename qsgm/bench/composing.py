@@ -17,8 +17,8 @@ from qsgm.bench.cutouts import CutOut, Frame, Mask, Point, Pose, cut_out, footpr
 from qsgm.bench.lighting import Camera, blurred_camera, dim_camera, mild_camera, photograph
 from qsgm.bench.surfaces import with_surface
 from qsgm.bench.things import TRIES, LaidThing, LooseThing, Target, cover
-from qsgm.crops import HALF_CROP_PX
 from qsgm.errors import QsgmError
+from qsgm.grasp.crops import HALF_CROP_PX
 
 Condition = Literal[
     "same_table",

@@ -12,10 +12,10 @@ from rich.text import Text
 from qsgm.bench.accuracy import groups_of
 from qsgm.bench.frames import BenchFrame
 from qsgm.bundle import Bundle
-from qsgm.finetuning import FinetuneResult, train
-from qsgm.preparing import KeptFeatures, Watch, prepare
-from qsgm.report import accuracy_json, fidelity_json, number, plain_table
-from qsgm.settings import Settings
+from qsgm.tune.prepare import KeptFeatures, Watch, prepare
+from qsgm.tune.report import accuracy_json, fidelity_json, number, plain_table
+from qsgm.tune.run import FinetuneResult, train
+from qsgm.tune.settings import Settings
 
 Floats = NDArray[np.float64]
 LEGEND = """cos: of int8 to float gradients, mean over a run; here its mean and the worst

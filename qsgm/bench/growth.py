@@ -16,9 +16,9 @@ from qsgm import defaults
 from qsgm.bench.speed import VARIANTS
 from qsgm.bench.tables import right_table
 from qsgm.bundle import Bundle
-from qsgm.preparing import SLICE
-from qsgm.report import number
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import SLICE
+from qsgm.tune.report import number
 
 INT8, FLOAT, BP = VARIANTS
 FORWARD = "forward"

@@ -14,10 +14,10 @@ from qsgm.bench.accuracy import ANGLE, DETECTION, METRICS, groups_of
 from qsgm.bench.frames import BenchFrame
 from qsgm.blocks import Blocks, parse_blocks
 from qsgm.bundle import Bundle
-from qsgm.finetuning import peak_activation_bytes, train
-from qsgm.preparing import Watch, prepare
-from qsgm.report import number, plain_table
-from qsgm.settings import Settings
+from qsgm.tune.prepare import Watch, prepare
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.run import peak_activation_bytes, train
+from qsgm.tune.settings import Settings
 
 Floats = NDArray[np.float64]
 LEGEND = """means over frames; angle: error in degrees, modulo 180°; better: share of the

@@ -24,10 +24,10 @@ from qsgm.bench.speed import TORCH, VARIANTS, run_once
 from qsgm.bench.tables import right_table
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import MANIFEST, Bundle, Precision, probe_file
-from qsgm.preparing import Watch
-from qsgm.report import number, plain_table
-from qsgm.settings import Settings, trunk_precision
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.settings import Settings, trunk_precision
 
 INT8, FLOAT, BP = VARIANTS
 # variant: its precision and, from the number of tuned layers, its blocks

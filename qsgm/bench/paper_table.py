@@ -19,7 +19,7 @@ from rich.table import Table
 from qsgm.bench.shapes import POOLED, Shape
 from qsgm.bench.tables import right_table
 from qsgm.blocks import LAYERS
-from qsgm.quantize import LABELS
+from qsgm.sgm.int8 import LABELS
 
 PAPER_BATCH = 64
 PADDED = 3  # up to this layer the paper's SGMs have 3x3 kernels, behind it 1x1

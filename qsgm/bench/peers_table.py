@@ -20,9 +20,9 @@ from qsgm.bench.step_jobs import step_seconds
 from qsgm.bench.tables import right_table
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
-from qsgm.preparing import Watch
-from qsgm.report import number
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import number
 
 # Of each kind of own step, and of a forward pass.
 TURNS = 400

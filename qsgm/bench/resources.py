@@ -23,11 +23,11 @@ from qsgm.bench.step_jobs import step_seconds
 from qsgm.bench.tables import right_table
 from qsgm.blocks import LAYERS
 from qsgm.bundle import FLOAT_BYTES, Bundle
-from qsgm.folded import FoldedSgm
-from qsgm.preparing import Watch
-from qsgm.quantize import ActivationBits
-from qsgm.report import number
-from qsgm.tuning import BATCH
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import ActivationBits
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import number
 
 # Of an int8 SGM: scale and bias of a row, low end and gain of an input, step and zero point of a
 # low plane.
@@ -171,7 +171,7 @@ def cost_of(bundle: Bundle, shape: Shape) -> Cost:
 
 
 def int8_bytes(sgm: FoldedSgm, bits: ActivationBits) -> int:
-    """Of the constants of an SGM in int8, as :func:`qsgm.quantize.constants` lists them."""
+    """Of the constants of an SGM in int8, as :func:`qsgm.sgm.int8.constants` lists them."""
     weights = 2 * sum(conv.weight.size for conv in sgm.convs)
     rows = sum(len(conv.bias) for conv in sgm.convs)
     low_plane = LOW_PLANE_BYTES if bits == 16 else 0

@@ -26,8 +26,8 @@ from qsgm.bench.scenes import ScenePlan
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
 from qsgm.images import write_png
-from qsgm.preparing import Watch
-from qsgm.report import to_json
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import to_json
 
 DEMONSTRATION = "demonstration.png"
 MASK = "mask.png"

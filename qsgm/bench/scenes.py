@@ -11,10 +11,10 @@ from qsgm.bench.composing import CONDITIONS, Composer, Condition, Scene, Subject
 from qsgm.bench.cutouts import Frame
 from qsgm.bench.judging import Answer, Judged, Tally, Truth, judge, threshold_for, truth_of
 from qsgm.bundle import Bundle, Recipe
-from qsgm.finetuning import train
-from qsgm.predict import Detection
-from qsgm.preparing import Watch, prepare
-from qsgm.settings import Settings
+from qsgm.grasp.heatmap import Detection
+from qsgm.tune.prepare import Watch, prepare
+from qsgm.tune.run import train
+from qsgm.tune.settings import Settings
 
 # Told about every scene as it is judged, while its picture is at hand.
 Look = Callable[[Scene, Judged], None]

@@ -24,8 +24,8 @@ from qsgm.bench.judging import (
     shares,
 )
 from qsgm.bench.scenes import MethodResults, ScenePlan
-from qsgm.report import number, plain_table
-from qsgm.settings import Settings
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.settings import Settings
 
 POOLED = "pooled"
 LEGEND = (

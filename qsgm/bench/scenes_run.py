@@ -16,9 +16,9 @@ from qsgm.bench.subjects import drawn_subjects, spread, subjects_of
 from qsgm.bundle import Bundle
 from qsgm.files import write_text_atomic
 from qsgm.images import write_png
-from qsgm.preparing import Watch
-from qsgm.report import to_json
-from qsgm.settings import Settings
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import to_json
+from qsgm.tune.settings import Settings
 
 
 @dataclass(frozen=True)

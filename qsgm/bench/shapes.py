@@ -7,7 +7,7 @@ import numpy as np
 
 from qsgm.blocks import LAYERS, Blocks
 from qsgm.bundle import FLOAT_BYTES, Bundle, head_file
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
 
 STRIDES = (2, 2, 2, 2, 1, 1)
 POOLED = 4  # of a crop, the pool behind it leaves one position

@@ -32,12 +32,12 @@ from qsgm.bench.peers_table import (
 )
 from qsgm.bench.step_jobs import check_steps
 from qsgm.bundle import Bundle
-from qsgm.crops import TRAIN_CROPS
 from qsgm.errors import QsgmError
-from qsgm.preparing import Watch
-from qsgm.report import number, plain_table
-from qsgm.settings import Settings, trunk_precision
-from qsgm.tuning import BATCH
+from qsgm.grasp.crops import TRAIN_CROPS
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import Watch
+from qsgm.tune.report import number, plain_table
+from qsgm.tune.settings import Settings, trunk_precision
 
 VARIANTS: Mapping[str, Sequence[str]] = {
     "sgm int8": ("--method", "sgm", "--int8"),

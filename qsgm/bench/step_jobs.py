@@ -9,8 +9,8 @@ import numpy as np
 
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import PRECISIONS, Bundle, Precision, head_file, step_file
-from qsgm.preparing import running_graphs
-from qsgm.tuning import BATCH, StepLoop
+from qsgm.tune.loop import BATCH, StepLoop
+from qsgm.tune.prepare import running_graphs
 from qsgm.weights import to_step_layout
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from qsgm.bench.composing import Subject, kind_of
 from qsgm.bench.frames import BenchFrame
-from qsgm.train.objects import OBJECT_KINDS, draw_frame
+from qsgm.train.grasp.objects import OBJECT_KINDS, draw_frame
 
 DRAWN_SUBJECTS = 24
 LEAST_ELONGATION = 1.35

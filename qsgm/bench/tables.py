@@ -3,7 +3,7 @@
 from rich.table import Table
 from rich.text import Text
 
-from qsgm.report import plain_table
+from qsgm.tune.report import plain_table
 
 
 def right_table(title: str, *headings: str) -> Table:

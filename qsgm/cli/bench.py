@@ -84,7 +84,7 @@ def bench_accuracy(
     """
     from qsgm.bench.accuracy import measure_accuracy
     from qsgm.bench.accuracy_report import accuracy_report_json, render
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     charts = None if pictures is None else host_module("qsgm.train.charts")
     lengths = parsed_run_lengths(short)
@@ -233,7 +233,7 @@ def bench_speed(
     """
     from qsgm.bench.peers_table import StepPlan
     from qsgm.bench.speed import measure_speed, render
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     plan = StepPlan(parsed_thread_counts(thread_counts), parsed_interpreters(peers or []))
     frame = frames_of(frames, 1)[0].path
@@ -283,7 +283,7 @@ def bench_memory(
 ) -> None:
     """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
     from qsgm.bench.memory import measure_memory
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     lengths = parsed_layer_counts(processes)
     host = host_module("qsgm.train.liveness")
@@ -341,7 +341,7 @@ def bench_fidelity(
 ) -> None:
     """int8 gradients against float and true ones along a run on every frame, worst cases named."""
     from qsgm.bench.fidelity import measure_fidelity
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     some = frames_of(frames, limit)
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
@@ -379,7 +379,7 @@ def bench_calibration(
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
     from qsgm.bench.calibration import VARIANTS, measure_calibration
     from qsgm.bench.frames import list_frames
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     chart = None if picture is None else host_module("qsgm.train.calibration_chart")
     folder = paths.calibration_folder(calib)

@@ -53,10 +53,10 @@ from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
-    from qsgm.finetuning import FinetuneResult
     from qsgm.grasp.others import Other
     from qsgm.grasp.source import Demonstration
-    from qsgm.settings import Settings
+    from qsgm.tune.run import FinetuneResult
+    from qsgm.tune.settings import Settings
 
 app = typer.Typer()
 
@@ -80,7 +80,7 @@ def pretrain(
     What was interrupted goes on where it stopped when the same command runs again.
     """
     chosen = {} if hidden is None else {"hidden": parsed_channels(hidden)}
-    host = host_module("qsgm.train.pretrain")
+    host = host_module("qsgm.train.pretraining.pretrain")
     config, loss = host.PretrainConfig(**chosen), host.Loss(encoding=encoding.value)
     with progress() as watch:
         host.pretrain(output, seed, device.value, watch, config=config, loss=loss)
@@ -100,7 +100,7 @@ def draw_calibration(
     as_json: JsonOption = False,
 ) -> None:
     """Draw a calibration set and the demo's two pictures (host)."""
-    host = host_module("qsgm.train.draw_calibration")
+    host = host_module("qsgm.train.grasp.draw_calibration")
     with progress() as watch:
         host.draw_calibration_set(output, count, seed, watch)
     if as_json:
@@ -197,8 +197,8 @@ def finetune(
 ) -> None:
     """Tune the network to the object in one frame or several, on the device."""
     from qsgm.files import check_replaceable
-    from qsgm.report import finetune_json, finetune_report
-    from qsgm.tuned import DESCRIPTION
+    from qsgm.grasp.tuned import DESCRIPTION
+    from qsgm.tune.report import finetune_json, finetune_report
 
     tuned, first = tuned_layers(layers, blocks), frames[0]
     centers = parsed_centers(center, len(frames))
@@ -243,10 +243,10 @@ def predict(
     as_json: JsonOption = False,
 ) -> None:
     """Find the tuned object: where it is, how far to move, how far to turn."""
+    from qsgm.grasp.pictures import draw_detection
+    from qsgm.grasp.tuned import load_object
     from qsgm.images import read_frame, write_png
-    from qsgm.pictures import draw_detection
-    from qsgm.report import detection_table, instances_table, predict_json
-    from qsgm.tuned import load_object
+    from qsgm.tune.report import detection_table, instances_table, predict_json
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
@@ -295,7 +295,7 @@ def fidelity(
     as_json: JsonOption = False,
 ) -> None:
     """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
-    from qsgm.report import fidelity_command_json, fidelity_command_report
+    from qsgm.tune.report import fidelity_command_json, fidelity_command_report
 
     chart = None if picture is None else host_module("qsgm.train.fidelity_chart")
     settings = settings_of(
@@ -324,7 +324,7 @@ def _finetune(
     bundle: "Bundle",
     settings: "Settings",
 ) -> "FinetuneResult":
-    from qsgm.finetuning import finetune as run_finetune
+    from qsgm.tune.run import finetune as run_finetune
 
     demonstrations = [_demonstration(*one) for one in zip(frames, centers, strict=True)]
     named = [_other(path) for path in others]
@@ -344,7 +344,7 @@ def _demonstration(path: Path, center_px: tuple[float, float] | None) -> "Demons
 def _other(path: Path) -> "Other":
     """A thing to tell the object apart from: what a frame shows, or a tuned object."""
     from qsgm.grasp.others import other_in
-    from qsgm.tuned import load_object
+    from qsgm.grasp.tuned import load_object
 
     return load_object(path).as_other() if path.is_dir() else other_in(_demonstration(path, None))
 

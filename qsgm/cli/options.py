@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from qsgm.bench.calibration import Variant
     from qsgm.blocks import Blocks
     from qsgm.bundle import Precision
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
 LARGEST_HIDDEN = 1024
 MOST_THREADS = 256
@@ -175,7 +175,7 @@ def settings_of(
     trunk: TrunkChoice | None = None,
 ) -> "Settings":
     """The settings that a command's options come to."""
-    from qsgm.settings import Settings
+    from qsgm.tune.settings import Settings
 
     if method is MethodName.BP and int8:
         complain("note: backpropagation runs in float; --int8 concerns SGMs only")

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import HALF_CROP_PX, CropPlan
-from qsgm.distractors import (
+from qsgm.grasp.crops import HALF_CROP_PX, CropPlan
+from qsgm.grasp.distractors import (
     Distractors,
     EdgePlan,
     PastePlan,

@@ -1,7 +1,7 @@
 """Whether a candidate is the taught object: many pieces of evidence weighed into one quality.
 
 A small network of one hidden layer, trained on drawn scenes with the object and without it
-(:mod:`qsgm.train.decision`). Its threshold is set on whole scenes, for a stated rate of false
+(:mod:`qsgm.train.grasp.decision`). Its threshold is set on whole scenes, for a stated rate of false
 alarms, and is part of the quality: from 0.5 on an object counts as found.
 """
 

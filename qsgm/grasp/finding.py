@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.angles import wrap_half_turn
+from qsgm.grasp.angles import wrap_half_turn
 from qsgm.grasp.correlation import Fit
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.judge import JUDGED, Appearance, best_fit, judge

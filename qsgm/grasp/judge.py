@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import HALF_CROP_PX
 from qsgm.grasp.alignment import Aligner
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.cells import Look
@@ -22,6 +21,7 @@ from qsgm.grasp.correlation import (
     middle_fit,
     pyramid_of,
 )
+from qsgm.grasp.crops import HALF_CROP_PX
 from qsgm.grasp.evidence import Reference, evidence, reference_of
 from qsgm.grasp.patch import PATCH_PX, Patch
 

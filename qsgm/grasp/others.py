@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.distractors import TILE_PX, Distractors, with_named
+from qsgm.grasp.distractors import TILE_PX, Distractors, with_named
 from qsgm.grasp.measuring import measured_span, moved_point, scaled_frame
 from qsgm.grasp.patch import PATCH_PX, Patch, cut_patch
 from qsgm.grasp.source import Demonstration

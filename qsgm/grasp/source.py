@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import CROP_PX, CROPS, CropPlan, plan_crops, widened, windows_of
-from qsgm.distractors import Distractors
 from qsgm.grasp.clutter import Addition, ClutterPlan, add_clutter, dimmed, joined, plan_clutter
+from qsgm.grasp.crops import CROP_PX, CROPS, CropPlan, plan_crops, widened, windows_of
+from qsgm.grasp.distractors import Distractors
 
 
 @dataclass(frozen=True)

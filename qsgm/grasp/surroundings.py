@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.crops import HALF_CROP_PX
+from qsgm.grasp.crops import HALF_CROP_PX
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.source import Demonstration
 

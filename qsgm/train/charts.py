@@ -20,7 +20,7 @@ from qsgm.bench.accuracy import (
     Runs,
 )
 from qsgm.files import write_bytes_atomic
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
 
 SIZE_INCHES, DPI = (9.0, 4.5), 200
 # Blue and vermilion of Okabe and Ito, which the colour-blind tell apart, too.

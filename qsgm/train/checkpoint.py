@@ -13,14 +13,14 @@ from typing import Any, get_args
 
 import torch
 
-from qsgm.angles import AngleEncoding
 from qsgm.blocks import LAYERS, parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
+from qsgm.grasp.angles import AngleEncoding
 from qsgm.grasp.decision import Decision
-from qsgm.train.curvature import Curvature
-from qsgm.train.graspnet import GraspNet, Loss
-from qsgm.train.sgm import SGM_LAYERS, Sgm
+from qsgm.train.model.curvature import Curvature
+from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.sgm import SGM_LAYERS, Sgm
 
 FORMAT = "qsgm-checkpoint"
 VERSION = 2

@@ -32,20 +32,14 @@ from qsgm.bundle import (
     step_file,
     trunk_file,
 )
-from qsgm.crops import cut_crops, label_crops, plan_crops
-from qsgm.distractors import FILE as DISTRACTORS
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
-from qsgm.folded import FoldedSgm
-from qsgm.quantize import ActivationBits, QuantizedSgm, quantize_sgm
-from qsgm.train.calibrate import AUTO, calibrate
-from qsgm.train.calibration_runs import EPOCHS, Trainee, prepare
-from qsgm.train.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.grasp.crops import cut_crops, label_crops, plan_crops
+from qsgm.grasp.distractors import FILE as DISTRACTORS
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
-from qsgm.train.curvature import FLAT
-from qsgm.train.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
-from qsgm.train.fold import FoldedNet, net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
@@ -57,12 +51,24 @@ from qsgm.train.graphs.trunk import (
     network_model,
     trunk_model,
 )
-from qsgm.train.graspnet import normalize
+from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.liveness import graph_memory
-from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
-from qsgm.train.sgm_fidelity import measure
-from qsgm.train.trunk_ranges import observe_trunk
-from qsgm.tuning import BATCH
+from qsgm.train.model.curvature import FLAT
+from qsgm.train.model.fold import (
+    FoldedNet,
+    net_fold_error,
+    run_folded,
+    run_folded_sgm,
+    sgm_fold_error,
+)
+from qsgm.train.model.graspnet import normalize
+from qsgm.train.quantization.calibrate import AUTO, calibrate
+from qsgm.train.quantization.calibration_runs import EPOCHS, Trainee, prepare
+from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.train.quantization.sgm_fidelity import measure
+from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
+from qsgm.train.quantization.trunk_ranges import observe_trunk
+from qsgm.tune.loop import BATCH
 
 SEED = 0
 # Of the frozen layers, unless the user says otherwise: in int8 they take longer (README).
@@ -94,12 +100,13 @@ def fold_and_quantize(
 
     Args:
         checkpoint_path: `sgm.pt`.
-        calib_folder: a calibration set, see :mod:`qsgm.train.draw_calibration`.
+        calib_folder: a calibration set, see :mod:`qsgm.train.grasp.draw_calibration`.
         output_folder: absent, empty, or an earlier bundle.
         watch: told about progress.
         epochs: length of each fine-tuning run that ranges are taken along.
         blocks: to be tuned beside :data:`GROUPED` and each layer on its own.
-        calibrator: whose ranges the SGMs get, see :func:`qsgm.train.calibrate.calibrate`.
+        calibrator: whose ranges the SGMs get, see
+            :func:`qsgm.train.quantization.calibrate.calibrate`.
         activation_bits: of the int8 SGMs' inputs and hidden tensors, in one u8 plane or two.
 
     Raises:

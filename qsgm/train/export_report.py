@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
-from qsgm.folded import FoldedSgm
-from qsgm.quantize import LABELS, QuantizedSgm, SgmRanges, constants
-from qsgm.report import fidelity_json, plain_table
-from qsgm.train.calibrate import EQUAL_COSINE, Calibration
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import LABELS, QuantizedSgm, SgmRanges, constants
+from qsgm.train.quantization.calibrate import EQUAL_COSINE, Calibration
+from qsgm.tune.report import fidelity_json, plain_table
 
 # (line break: in a terminal only)
 _HEADERS = (

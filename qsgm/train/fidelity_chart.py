@@ -11,11 +11,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from qsgm.drift import LEAST_COSINE
-from qsgm.finetuning import FinetuneResult
-from qsgm.preparing import STEPS_PER_EPOCH
 from qsgm.train.charts import DPI, GREY, SMALL, TEXT, save_png
-from qsgm.tuning import BATCH
+from qsgm.tune.drift import LEAST_COSINE
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import STEPS_PER_EPOCH
+from qsgm.tune.run import FinetuneResult
 
 Floats = NDArray[np.float64]
 SIZE_INCHES = (9.0, 8.0)

@@ -19,11 +19,9 @@ from qsgm.bench.frames import BenchFrame
 from qsgm.bench.growth import CROPS, FEATURES, GrowthReport, Series
 from qsgm.bench.step_jobs import median_seconds, start_of
 from qsgm.bundle import Bundle, step_file
-from qsgm.crops import CROPS as USUAL_CROPS
-from qsgm.crops import TRAIN_CROPS, label_crops
+from qsgm.grasp.crops import CROPS as USUAL_CROPS
+from qsgm.grasp.crops import TRAIN_CROPS, label_crops
 from qsgm.grasp.source import Demonstration, crop_source
-from qsgm.preparing import Array, Watch, ignore, running_graphs, see
-from qsgm.settings import Settings
 from qsgm.train.growth_jobs import (
     METHODS,
     TUNED,
@@ -33,7 +31,9 @@ from qsgm.train.growth_jobs import (
     trunk_jobs,
     wide_jobs,
 )
-from qsgm.tuning import BATCH, Features, StepLoop, tune
+from qsgm.tune.loop import BATCH, Features, StepLoop, tune
+from qsgm.tune.prepare import Array, Watch, ignore, running_graphs, see
+from qsgm.tune.settings import Settings
 
 # The layer whose SGM is timed alone, by the SGM's kernel.
 LAYER_BEFORE = {1: 4, 3: 3}

@@ -22,7 +22,7 @@ from qsgm.bench.growth import (
     Series,
 )
 from qsgm.train.charts import DPI, GREY, SMALL, TEXT, save_png
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
 
 SIZE_INCHES = (7.2, 6.6)
 # Of Okabe and Ito, which the colour-blind tell apart.

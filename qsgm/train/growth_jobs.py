@@ -27,15 +27,14 @@ from qsgm.bench.growth import (
 from qsgm.bench.step_jobs import forward_job, start_of, still_loop
 from qsgm.blocks import LAYERS, Blocks, one_block, single_layers, tuned_layers
 from qsgm.bundle import Bundle, Precision, head_file, step_file
-from qsgm.preparing import SLICE
-from qsgm.quantize import LABEL_HIGH, LABEL_LOW, LABELS, ActivationBits
 from qsgm.runtime import open_session
+from qsgm.sgm.int8 import LABEL_HIGH, LABEL_LOW, LABELS, ActivationBits
 from qsgm.train.graphs.layers import CROP_SIDE, input_side
 from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import int8_trunk_model, trunk_model
-from qsgm.train.graspnet import CHANNELS, Loss
+from qsgm.train.model.graspnet import CHANNELS, Loss
 from qsgm.train.wide import (
     WideNet,
     quantized,
@@ -46,7 +45,8 @@ from qsgm.train.wide import (
     wide_net,
     wide_sgms,
 )
-from qsgm.tuning import BATCH
+from qsgm.tune.loop import BATCH
+from qsgm.tune.prepare import SLICE
 
 TUNED = defaults.LAYERS
 METHODS: Mapping[str, tuple[Precision, Callable[[int], Blocks]]] = {

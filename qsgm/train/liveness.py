@@ -30,9 +30,9 @@ from qsgm.bench.memory import StepMemory
 from qsgm.bench.step_jobs import start_of, still_loop
 from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle, Precision, step_file
-from qsgm.preparing import running_graphs
 from qsgm.runtime import session_options
 from qsgm.train.graphs.inspection import all_nodes, bodies
+from qsgm.tune.prepare import running_graphs
 
 # Their result is their first input under another shape.
 VIEWS = frozenset({"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"})

@@ -27,9 +27,9 @@ from qsgm.bundle import (
     step_file,
     trunk_file,
 )
-from qsgm.distractors import FILE as DISTRACTORS
 from qsgm.errors import QsgmError
 from qsgm.files import check_replaceable, new_folder
+from qsgm.grasp.distractors import FILE as DISTRACTORS
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
 from qsgm.train.graphs.short_names import shorten
 

@@ -21,14 +21,14 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.angles import angle_error, decode_angle, mean_direction
 from qsgm.bundle import NETWORK, Bundle, load_bundle
-from qsgm.crops import TRAIN_CROPS, CropPlan, label_crops
+from qsgm.grasp.angles import angle_error, decode_angle, mean_direction
+from qsgm.grasp.crops import TRAIN_CROPS, CropPlan, label_crops
 from qsgm.grasp.shown import shown
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.images import read_demonstration
-from qsgm.train.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss, normalize
-from qsgm.tuning import BATCH, batches, rate_factor
+from qsgm.train.model.graspnet import LAYERS, POOL, POOL_AFTER_LAYER, STRIDES, Loss, normalize
+from qsgm.tune.loop import BATCH, batches, rate_factor
 
 RATE = 1e-3  # Adam's, as the paper has it
 SLICE = 50  # crops at once

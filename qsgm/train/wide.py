@@ -13,8 +13,8 @@ import torch
 from onnx import ModelProto
 
 from qsgm.bundle import Bundle
-from qsgm.folded import FloatArray, FoldedConv, FoldedSgm, float_trace
-from qsgm.quantize import (
+from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_trace
+from qsgm.sgm.int8 import (
     LABEL_HIGH,
     LABEL_LOW,
     LABELS,
@@ -23,16 +23,16 @@ from qsgm.quantize import (
     SgmRanges,
     quantize_sgm,
 )
-from qsgm.train.curvature import Curvature
-from qsgm.train.fold import FoldedLayer, FoldedNet
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.layers import CROP_SIDE
 from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graphs.step import AnySgm
-from qsgm.train.graspnet import CHANNELS, KERNELS, LAYERS, POOL, POOL_AFTER_LAYER, STRIDES
-from qsgm.train.quantize_trunk import QuantizedLayer, feature_steps, quantize_trunk
-from qsgm.train.sgm import KERNEL_BEHIND_LAYER
-from qsgm.train.trunk_ranges import observe_crops
+from qsgm.train.model.curvature import Curvature
+from qsgm.train.model.fold import FoldedLayer, FoldedNet
+from qsgm.train.model.graspnet import CHANNELS, KERNELS, LAYERS, POOL, POOL_AFTER_LAYER, STRIDES
+from qsgm.train.model.sgm import KERNEL_BEHIND_LAYER
+from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
+from qsgm.train.quantization.trunk_ranges import observe_crops
 from qsgm.weights import to_step_layout
 
 SEED = 0

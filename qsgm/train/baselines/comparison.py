@@ -16,24 +16,24 @@ from torch import Tensor
 
 from qsgm.bench.frames import BenchFrame
 from qsgm.blocks import single_layers
-from qsgm.crops import TRAIN_CROPS, VALIDATION_CROPS
-from qsgm.report import number, plain_table
-from qsgm.train.baselines.backpropagation import Backpropagation
-from qsgm.train.baselines.direct_feedback import DirectFeedbackAlignment
-from qsgm.train.baselines.feedback_alignment import FeedbackAlignment, random_feedback
-from qsgm.train.baselines.interface import Baseline
-from qsgm.train.baselines.online_sgms import OnlineSgms, bootstrapped_target
-from qsgm.train.baselines.projections import random_projections
-from qsgm.train.baselines.static_sgms import StaticSgms
-from qsgm.train.baselines.target_projection import TargetProjection
-from qsgm.train.baselines.tuning import MakeOptimizer, Recipe, adam, run_baseline, sgd
+from qsgm.grasp.crops import TRAIN_CROPS, VALIDATION_CROPS
 from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.evaluate import UpdateRule, fine_tune, score
-from qsgm.train.graspnet import LAYERS
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import CENTER_PX, TaskSet, make_task, start_states
-from qsgm.tuning import BATCH, short_run_factor
+from qsgm.train.model.graspnet import LAYERS
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.paper.baselines.backpropagation import Backpropagation
+from qsgm.train.paper.baselines.direct_feedback import DirectFeedbackAlignment
+from qsgm.train.paper.baselines.feedback_alignment import FeedbackAlignment, random_feedback
+from qsgm.train.paper.baselines.interface import Baseline
+from qsgm.train.paper.baselines.online_sgms import OnlineSgms, bootstrapped_target
+from qsgm.train.paper.baselines.projections import random_projections
+from qsgm.train.paper.baselines.static_sgms import StaticSgms
+from qsgm.train.paper.baselines.target_projection import TargetProjection
+from qsgm.train.paper.baselines.tuning import MakeOptimizer, Recipe, adam, run_baseline, sgd
+from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune, score
+from qsgm.train.pretraining.tasks import CENTER_PX, TaskSet, make_task, start_states
+from qsgm.tune.loop import BATCH, short_run_factor
+from qsgm.tune.report import number, plain_table
 
 GRID: Mapping[str, tuple[MakeOptimizer, tuple[float, ...]]] = {
     "sgd": (sgd, (0.003, 0.01, 0.03)),

@@ -1,4 +1,4 @@
-"""One tuned layer in a graph: the arithmetic of :mod:`qsgm.train.local`.
+"""One tuned layer in a graph: the arithmetic of :mod:`qsgm.train.model.local`.
 
 Activations are matrices, (B * P, C): a row per crop and position. A convolution is a gather of
 windows (im2col) and one matrix product, and its weight gradient is another product with the same
@@ -17,10 +17,10 @@ from numpy.typing import DTypeLike, NDArray
 from onnx import TensorProto
 
 from qsgm.blocks import tuned_layers
-from qsgm.train.curvature import Curvature
-from qsgm.train.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
 from qsgm.train.graphs.build import Graph, Ops, Product, Value
 from qsgm.train.graphs.optimizers import Gradient, value_of
+from qsgm.train.model.curvature import Curvature
+from qsgm.train.model.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
 from qsgm.weights import to_step_layout
 
 CROP_SIDE = 128

@@ -1,8 +1,8 @@
 """The loss in a graph: output activation, value, and the error that starts every gradient."""
 
-from qsgm.angles import AngleEncoding
+from qsgm.grasp.angles import AngleEncoding
 from qsgm.train.graphs.build import Ops, Value
-from qsgm.train.graspnet import Loss
+from qsgm.train.model.graspnet import Loss
 
 
 def channels(op: Ops, x: Value, start: int, stop: int) -> Value:

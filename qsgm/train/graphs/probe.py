@@ -5,12 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto
 
-from qsgm.angles import AngleEncoding
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
-from qsgm.folded import FoldedSgm
-from qsgm.quantize import QuantizedSgm
-from qsgm.train.fold import FoldedNet
+from qsgm.grasp.angles import AngleEncoding
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import QuantizedSgm
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import (
     Batch,
@@ -35,7 +34,8 @@ from qsgm.train.graphs.sgm import (
     underflow_fraction,
 )
 from qsgm.train.graphs.step import forward_all, sgms_behind
-from qsgm.train.graspnet import Loss
+from qsgm.train.model.fold import FoldedNet
+from qsgm.train.model.graspnet import Loss
 
 
 def probe_model(

@@ -8,8 +8,8 @@ ONNX Runtime has no integer Conv with a float result, so int8 cuts windows for a
 
 import numpy as np
 
-from qsgm.folded import FoldedSgm
-from qsgm.quantize import (
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import (
     LABELS,
     PLANE_STEPS,
     U8_ZERO,

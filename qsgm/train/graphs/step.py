@@ -14,10 +14,8 @@ from onnx import ModelProto
 
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
-from qsgm.folded import FoldedSgm
-from qsgm.quantize import LABELS, QuantizedSgm
-from qsgm.train.curvature import FLAT, Curvature
-from qsgm.train.fold import FoldedNet
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import LABELS, QuantizedSgm
 from qsgm.train.graphs.build import Graph, Value
 from qsgm.train.graphs.layers import (
     Batch,
@@ -36,7 +34,9 @@ from qsgm.train.graphs.layers import (
 from qsgm.train.graphs.loss import loss_and_error
 from qsgm.train.graphs.optimizers import Gradient, Optimizer, Rule, plus
 from qsgm.train.graphs.sgm import sgm_gradient
-from qsgm.train.graspnet import Loss
+from qsgm.train.model.curvature import FLAT, Curvature
+from qsgm.train.model.fold import FoldedNet
+from qsgm.train.model.graspnet import Loss
 
 AnySgm = FoldedSgm | QuantizedSgm
 

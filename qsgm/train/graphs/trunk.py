@@ -5,14 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto, TensorProto
 
-from qsgm.angles import AngleEncoding
 from qsgm.errors import QsgmError
-from qsgm.quantize import U8_ZERO, around_zero_point
-from qsgm.train.fold import FoldedNet, on_pixels
+from qsgm.grasp.angles import AngleEncoding
+from qsgm.sgm.int8 import U8_ZERO, around_zero_point
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import CROP_SIDE, features_dtype, input_side, normalized
 from qsgm.train.graphs.loss import activate
-from qsgm.train.quantize_trunk import QuantizedLayer
+from qsgm.train.model.fold import FoldedNet, on_pixels
+from qsgm.train.quantization.trunk import QuantizedLayer
 
 
 def trunk_model(net: FoldedNet, last_frozen: int) -> ModelProto:

@@ -1,10 +1,10 @@
 """Layers that keep their batchnorm, trained by SGMs: the paper's own setting (section 3.2).
 
 A layer is updated by the gradient its SGM makes of its activation and the label. The true gradients
-are carried back beside, for SGMs that follow them. :class:`qsgm.train.sgm.SgmLayer` does this in a
-network's own backward pass; with several of them in a row, though, what reaches one is the next
-one's synthetic gradient. Here autograd goes back one layer at a time, so that all can follow the
-truth.
+are carried back beside, for SGMs that follow them. :class:`qsgm.train.model.sgm.SgmLayer` does this
+in a network's own backward pass; with several of them in a row, though, what reaches one is the
+next one's synthetic gradient. Here autograd goes back one layer at a time, so that all can follow
+the truth.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.train.evaluate import score
-from qsgm.train.graspnet import LAYERS, GraspNet, Loss
-from qsgm.train.maml import MOMENTUM
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet, shuffled_batches, start_states
+from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.pretraining.evaluate import score
+from qsgm.train.pretraining.maml import MOMENTUM
+from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
 RATE = 1e-1  # paper section 4.2: of network and SGMs, in pretraining and fine-tuning
 Criterion = Callable[[Tensor, Tensor], Tensor]  # (synthetic, true) -> what an SGM lowers

@@ -8,7 +8,7 @@ from torch import Tensor
 from qsgm.train.paper.objects import OBJECTS, ObjectCrops, cut_object
 from qsgm.train.paper.pretraining import PretrainingSizes, pretrain_without
 from qsgm.train.paper.systems import RATES, all_systems, tune_object
-from qsgm.train.pretrain import one_thread
+from qsgm.train.pretraining.pretrain import one_thread
 
 # (stage, done, of how many)
 Watch = Callable[[str, int, int], None]

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from qsgm.crops import cut_crops, label_crops, plan_crops
-from qsgm.train.graspnet import Loss
-from qsgm.train.objects import DrawnFrame, draw_frame
-from qsgm.train.tasks import CENTER_PX, FRAME_HW
+from qsgm.grasp.crops import cut_crops, label_crops, plan_crops
+from qsgm.train.grasp.objects import DrawnFrame, draw_frame
+from qsgm.train.model.graspnet import Loss
+from qsgm.train.pretraining.tasks import CENTER_PX, FRAME_HW
 
 # The paper's label: sine and cosine of an angle in (-90, 90] degrees, not smoothed.
 PAPER_LOSS = Loss(encoding="paper", label_smoothing=0.0)

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.baselines.static_sgms import LabelFreeSgm
-from qsgm.train.graspnet import LAYERS, GraspNet, normalize
-from qsgm.train.maml import MOMENTUM
+from qsgm.train.model.graspnet import LAYERS, GraspNet, normalize
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.paper.baselines.static_sgms import LabelFreeSgm
 from qsgm.train.paper.driven import (
     RATE,
     Driver,
@@ -31,9 +31,9 @@ from qsgm.train.paper.driven import (
     last_layers,
 )
 from qsgm.train.paper.objects import PAPER_LOSS, ObjectCrops
-from qsgm.train.sgm import Sgm
-from qsgm.train.tasks import features_of
-from qsgm.tuning import BATCH
+from qsgm.train.pretraining.maml import MOMENTUM
+from qsgm.train.pretraining.tasks import features_of
+from qsgm.tune.loop import BATCH
 
 ADAM_RATE = 1e-3  # paper section 4.1
 Sgms = Mapping[int, Sgm]

@@ -11,12 +11,12 @@ from rich.table import Table
 from rich.text import Text
 
 from qsgm.images import write_png
-from qsgm.report import number, plain_table
 from qsgm.train.paper.experiment import PaperConfig, PaperResults
 from qsgm.train.paper.notes import NOTES
 from qsgm.train.paper.objects import OBJECTS, contact_sheet
 from qsgm.train.paper.published import TABLE_1, TABLE_2, Published, PublishedSystem
 from qsgm.train.paper.systems import ADAM, BATCHNORM, sgd_variant
+from qsgm.tune.report import number, plain_table
 
 METRICS = {"detection": 1, "angle": 2}  # and where it stands in a score
 _FORMS = {"detection": "{:.2f}", "angle": "{:.1f}"}

@@ -7,22 +7,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from qsgm.train.baselines.backpropagation import Backpropagation
-from qsgm.train.baselines.direct_feedback import DirectFeedbackAlignment
-from qsgm.train.baselines.feedback_alignment import FeedbackAlignment, random_feedback
-from qsgm.train.baselines.interface import Baseline
-from qsgm.train.baselines.online_sgms import OnlineSgms
-from qsgm.train.baselines.projections import random_projections
-from qsgm.train.baselines.static_sgms import StaticSgms
-from qsgm.train.baselines.target_projection import TargetProjection
-from qsgm.train.baselines.tuning import Recipe, adam, constant_rate, run_baseline, sgd
-from qsgm.train.graspnet import LAYERS, GraspNet
+from qsgm.train.model.graspnet import LAYERS, GraspNet
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.model.start import folded_start
+from qsgm.train.paper.baselines.backpropagation import Backpropagation
+from qsgm.train.paper.baselines.direct_feedback import DirectFeedbackAlignment
+from qsgm.train.paper.baselines.feedback_alignment import FeedbackAlignment, random_feedback
+from qsgm.train.paper.baselines.interface import Baseline
+from qsgm.train.paper.baselines.online_sgms import OnlineSgms
+from qsgm.train.paper.baselines.projections import random_projections
+from qsgm.train.paper.baselines.static_sgms import StaticSgms
+from qsgm.train.paper.baselines.target_projection import TargetProjection
+from qsgm.train.paper.baselines.tuning import Recipe, adam, constant_rate, run_baseline, sgd
 from qsgm.train.paper.driven import Driver, FixedSgms, FollowingSgms, tune_with_batchnorm
 from qsgm.train.paper.objects import PAPER_LOSS, ObjectCrops
 from qsgm.train.paper.pretraining import ADAM_RATE, Pretrained, Sgms
-from qsgm.train.sgm import Sgm
-from qsgm.train.start import folded_start
-from qsgm.train.tasks import TaskSet, features_of
+from qsgm.train.pretraining.tasks import TaskSet, features_of
 
 ADAM = "Adam 0.001"
 BATCHNORM = "BN, SGD 0.1"

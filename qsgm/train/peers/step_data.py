@@ -18,10 +18,10 @@ from onnx import numpy_helper
 from qsgm.blocks import LAYERS, one_block, tuned_layers
 from qsgm.bundle import Bundle, load_bundle, step_file, trunk_file
 from qsgm.images import read_demonstration
-from qsgm.preparing import Prepared, prepare
-from qsgm.settings import Settings
-from qsgm.train.graspnet import ANGLE_WEIGHT, POOL, POOL_AFTER_LAYER, STRIDES
-from qsgm.tuning import BATCH, StepLoop, batches
+from qsgm.train.model.graspnet import ANGLE_WEIGHT, POOL, POOL_AFTER_LAYER, STRIDES
+from qsgm.tune.loop import BATCH, StepLoop, batches
+from qsgm.tune.prepare import Prepared, prepare
+from qsgm.tune.settings import Settings
 
 CROPS = 4 * BATCH  # few enough to stay in a cache: copying them is not what is compared
 RATE = 0.01

@@ -1,0 +1,408 @@
+"""A tuned object: a folder with a stand-alone ONNX network, how to read it, and the report.
+
+Beside the network lie the demonstration's patch, by which places that the network proposes are
+judged, and all that tells how the object was made. Folders of version 1 have no patch: they are
+read as ever, and the network alone says where the object is.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.bundle import NETWORK, read_manifest, require_keys
+from qsgm.errors import QsgmError
+from qsgm.files import new_folder
+from qsgm.grasp.angles import ENCODINGS, AngleEncoding
+from qsgm.grasp.candidates import candidate_cells
+from qsgm.grasp.crops import CROP_PX
+from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
+from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
+from qsgm.grasp.heatmap import Detection, Place, locate, refine
+from qsgm.grasp.judge import JUDGED, cell_center
+from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
+from qsgm.grasp.others import Other
+from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
+from qsgm.grasp.shown import View
+from qsgm.runtime import open_session, running
+
+FORMAT = "qsgm-object"
+VERSIONS = (1, 2)
+DESCRIPTION = "object.json"
+REPORT = "report.json"
+PATCH = "patch.png"
+FOUND_FROM = 0.5
+# Without a decision the patch moves a detection only where it fits as well as that.
+STRONG_CORRELATION = 0.7
+# A frame is mirrored so far beyond its border (at the object's scale) that windows can be centred
+# on objects that lie close to it.
+MARGIN_PX = 48
+_LEAST_SIDE_PX = 64
+# Where that is asked for, an object is looked for as if it were so many times as large, too. Four
+# more looks are four more occasions to be wrong: there a place has to be surer.
+OTHER_SIZES = (0.5, 0.7, 1.4, 2.0)
+SURE_AT_OTHER_SIZES = 0.9
+# At the object's scale, larger frames than that are not looked at again.
+_LARGEST_SIDE_PX = 2048
+# Two places of the network that are closer are of the same object.
+_APART_PX = 48.0
+_COMMAND = "qsgm finetune -o DIR"
+_ADVICE = "tune the object again with `qsgm finetune`"
+_KEYS: dict[str, type] = {"name": str, "encoding": str, "offset_rad": float, "sha256": str}
+_NEW_KEYS: dict[str, type] = {"scale": float, "views": list, "made": dict}
+
+
+@dataclass(frozen=True)
+class ObjectDescription:
+    """What `predict` has to know beside the network."""
+
+    name: str
+    encoding: AngleEncoding
+    offset_rad: float  # orientation of the demonstration as the network sees it
+    scale: float = 1.0  # what frames are scaled by before the network sees them
+    views: tuple[View, ...] = ()  # none in an object of version 1
+    decision: Decision | None = None
+    made: Mapping[str, Any] = field(default_factory=dict)  # from what, by what
+
+
+class TunedObject:
+    """A tuned object, ready to be looked for."""
+
+    def __init__(self, description: ObjectDescription, network: Path | bytes, threads: int) -> None:
+        self.description = description
+        self._session = open_session(network, threads)
+        inputs = [value.name for value in self._session.get_inputs()]
+        outputs = [value.name for value in self._session.get_outputs()]
+        if (inputs, outputs) != (["frame"], ["heatmap"]):
+            raise QsgmError(
+                f"the network of {description.name!r} takes {inputs} and gives {outputs}, expected "
+                f"a frame and its heatmap; {_ADVICE}"
+            )
+
+    def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """A frame (H, W, 3) at the object's scale to quality, sine and cosine (3, rows, cols)."""
+        with running(f"the object {self.description.name!r}", _ADVICE):
+            heatmap: NDArray[np.float32] = self._session.run(["heatmap"], {"frame": frame})[0]
+        return heatmap
+
+    def locate(self, frame: NDArray[np.uint8]) -> tuple[Detection, NDArray[np.float32]]:
+        """Where the object is in a frame (H, W, 3), and the heatmap that says so.
+
+        The network proposes places, what the object looked like decides between them and says where
+        exactly and how far turned it is. Everything is in the frame's own pixels.
+        """
+        seen = self._seen(frame)
+        heatmap = self.heatmap(seen)
+        best, *others = self._detections(seen, heatmap, JUDGED)
+        best = self._refined(best, seen)
+        places = tuple(_as_place(one) for one in (best, *others))
+        return self._in_frame(replace(best, candidates=places), frame), heatmap
+
+    def locate_at_any_distance(
+        self, frame: NDArray[np.uint8]
+    ) -> tuple[Detection, NDArray[np.float32]]:
+        """As :meth:`locate`; where nothing is found, from half to twice the distance as well."""
+        first = self.locate(frame)
+        if first[0].found:
+            return first
+        looks = [other.locate(frame) for other in self._at_other_sizes(frame)]
+        best = max(looks, key=lambda look: look[0].quality, default=first)
+        return best if best[0].quality >= SURE_AT_OTHER_SIZES else first
+
+    def _at_other_sizes(self, frame: NDArray[np.uint8]) -> Iterator["TunedObject"]:
+        """The same object as if it were larger or smaller, where the frame can be searched so."""
+        for size in OTHER_SIZES:
+            scale = self.description.scale / size
+            sides = scaled_shape(frame.shape[:2], scale)
+            if min(sides) >= self._least_side_px and max(sides) <= _LARGEST_SIDE_PX:
+                other = copy(self)
+                other.description = replace(self.description, scale=scale)
+                yield other
+
+    def locate_all(self, frame: NDArray[np.uint8]) -> list[Detection]:
+        """Every instance of the object in a frame (H, W, 3), the surest first."""
+        seen = self._seen(frame)
+        found = self._detections(seen, self.heatmap(seen), MOST_INSTANCES)
+        refined = [self._refined(one, seen) for one in found if one.found]
+        return [self._in_frame(one, frame) for one in refined]
+
+    def as_other(self) -> Other:
+        """What it looks like, for another object to be told apart from it.
+
+        Raises:
+            QsgmError: the object is of version 1, which does not know.
+        """
+        about = self.description
+        if not about.views:
+            raise QsgmError(
+                f"{about.name!r} was tuned by a version of qsgm that kept no picture of it; "
+                f"{_ADVICE}, or pass a frame of it"
+            )
+        return Other(about.views[0].patch, about.scale)
+
+    @cached_property
+    def _finder(self) -> Finder | None:
+        """None in an object without a patch."""
+        about = self.description
+        if not about.views:
+            return None
+        return Finder(about.views)
+
+    @property
+    def _margin_px(self) -> int:
+        """Objects of version 1 see frames as they are."""
+        return MARGIN_PX if self.description.views else 0
+
+    @property
+    def _least_side_px(self) -> int:
+        """What has to be left of a frame at the object's scale."""
+        return _LEAST_SIDE_PX if self._margin_px else CROP_PX
+
+    def _seen(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The frame at the object's scale, mirrored beyond its border.
+
+        Raises:
+            QsgmError: too little is left of it.
+        """
+        scaled, margin = scaled_frame(frame, self.description.scale), self._margin_px
+        least = self._least_side_px
+        if min(scaled.shape[:2]) < least:
+            (height, width), (low, narrow) = frame.shape[:2], scaled.shape[:2]
+            raise QsgmError(
+                f"a frame of {width}x{height} px has {narrow}x{low} at the scale of "
+                f"{self.description.name!r}: expected at least {least} on each side; take it as "
+                "the object's demonstration was taken"
+            )
+        how = cv2.BORDER_REFLECT_101
+        seen = cv2.copyMakeBorder(scaled, margin, margin, margin, margin, how)
+        return np.asarray(seen, dtype=np.uint8)
+
+    def _detections(
+        self, seen: NDArray[np.uint8], heatmap: NDArray[np.float32], count: int
+    ) -> list[Detection]:
+        """The best places first, at least one, none of them refined by the network yet."""
+        coarse = self._at(heatmap, seen)
+        decision = self.description.decision
+        if self._finder is None or decision is None:
+            return [coarse, *self._further(coarse, seen, heatmap, count)]
+        sightings = self._finder.find(seen, heatmap, decision, count)
+        return [_as_detection(one) for one in sightings]
+
+    def _further(
+        self,
+        coarse: Detection,
+        seen: NDArray[np.uint8],
+        heatmap: NDArray[np.float32],
+        count: int,
+    ) -> list[Detection]:
+        """What else the network sees, apart from its best place."""
+        places = [coarse]
+        for cell in candidate_cells(heatmap[0], count):
+            center = cell_center(cell)
+            if all(math.dist(center, place.center_px) >= _APART_PX for place in places):
+                places.append(self._at(_around(heatmap, cell), seen))
+        return places[1:]
+
+    def _at(self, heatmap: NDArray[np.float32], seen: NDArray[np.uint8]) -> Detection:
+        height, width = seen.shape[:2]
+        about = self.description
+        return locate(heatmap, (height, width), about.offset_rad, about.encoding, FOUND_FROM)
+
+    def _refined(self, place: Detection, seen: NDArray[np.uint8]) -> Detection:
+        """A closer look by the network where the patch had none, or none worth the name."""
+        if not place.found or place.refined_by == "patch":
+            return place
+        about = self.description
+        closer = refine(place, seen, self.heatmap, about.offset_rad, about.encoding)
+        if self._finder is None or about.decision is not None:
+            return closer
+        laid = self._finder.lay(seen, closer.center_px)
+        return _moved(closer, laid) if laid.fit.score >= STRONG_CORRELATION else closer
+
+    def _in_frame(self, place: Detection, frame: NDArray[np.uint8]) -> Detection:
+        """A place of what the network saw in the frame's own pixels."""
+        height, width = frame.shape[:2]
+        center = self._point_in(frame, place.center_px)
+        places = (
+            replace(one, center_px=self._point_in(frame, one.center_px)) for one in place.candidates
+        )
+        return replace(
+            place,
+            center_px=center,
+            displacement_px=(center[0] - width / 2, center[1] - height / 2),
+            scale=self.description.scale,
+            margin_px=self._margin_px,
+            candidates=tuple(places),
+        )
+
+    def _point_in(
+        self, frame: NDArray[np.uint8], point_px: tuple[float, float]
+    ) -> tuple[float, float]:
+        x, y = (value - self._margin_px for value in point_px)
+        scale = self.description.scale
+        if scale == 1.0:
+            return x, y
+        scaled_hw = scaled_shape(frame.shape[:2], scale)
+        return moved_point((x, y), scaled_hw, frame.shape[:2])
+
+
+def save_object(
+    folder: Path, description: ObjectDescription, network: bytes, report: dict[str, Any]
+) -> None:
+    """Write a tuned object; the folder appears complete or not at all.
+
+    Raises:
+        QsgmError: the folder cannot be written, or holds something else.
+    """
+    patches = {
+        PATCH if number == 1 else f"patch_{number}.png": encode_patch(view.patch)
+        for number, view in enumerate(description.views, start=1)
+    }
+    head = {"format": FORMAT, "version": VERSIONS[-1], "sha256": _sha256(network)}
+    with new_folder(folder, DESCRIPTION) as new:
+        (new / NETWORK).write_bytes(network)
+        for name, data in patches.items():
+            (new / name).write_bytes(data)
+        values = head | _to_json(description, patches)
+        (new / DESCRIPTION).write_text(json.dumps(values, indent=1) + "\n")
+        (new / REPORT).write_text(json.dumps(report, indent=1) + "\n")
+
+
+def load_object(folder: Path, threads: int = 1) -> TunedObject:
+    """Read a tuned object back.
+
+    Raises:
+        QsgmError: it is missing, altered, or something else.
+    """
+    manifest = read_manifest(folder, FORMAT, VERSIONS, _COMMAND)
+    first = manifest["version"] == VERSIONS[0]
+    require_keys(folder / DESCRIPTION, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
+    description = ObjectDescription(manifest["name"], manifest["encoding"], manifest["offset_rad"])
+    if description.encoding not in ENCODINGS or not math.isfinite(description.offset_rad):
+        raise QsgmError(
+            f"{folder / DESCRIPTION}: expected encoding {' or '.join(ENCODINGS)} and a finite "
+            f"offset_rad, got {description.encoding!r} and {description.offset_rad}; {_ADVICE}"
+        )
+    path = folder / NETWORK
+    if not path.is_file() or _sha256(path.read_bytes()) != manifest["sha256"]:
+        raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    if not first:
+        description = _with_looks(description, folder, manifest)
+    return TunedObject(description, path, threads)
+
+
+def _to_json(about: ObjectDescription, patches: Mapping[str, bytes]) -> dict[str, Any]:
+    decision = about.decision
+    return {
+        "name": about.name,
+        "encoding": about.encoding,
+        "offset_rad": about.offset_rad,
+        "scale": about.scale,
+        "views": [
+            {
+                "file": name,
+                "sha256": _sha256(data),
+                "center_px": list(view.patch.center_px),
+                "cut_out": view.patch.cut_out,
+                "turn_rad": view.turn_rad,
+                "whole": view.whole,
+            }
+            for view, (name, data) in zip(about.views, patches.items(), strict=True)
+        ],
+        "decision": None if decision is None else decision.to_json(),
+        "threshold": {
+            "quality": FOUND_FROM,
+            "false_alarm_rate": None if decision is None else FALSE_ALARM_RATE,
+        },
+        "made": dict(about.made),
+    }
+
+
+def _with_looks(
+    description: ObjectDescription, folder: Path, manifest: Mapping[str, Any]
+) -> ObjectDescription:
+    """What an object of version 2 says beyond one of version 1.
+
+    Raises:
+        QsgmError: a patch is missing or altered, or the description says nonsense.
+    """
+    path = folder / DESCRIPTION
+    decision = manifest.get("decision")
+    try:
+        views = tuple(_view(folder, one) for one in manifest["views"])
+        scale = float(manifest["scale"])
+        sane = 0 < scale <= MOST_ENLARGED and all(math.isfinite(one.turn_rad) for one in views)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        sane = False
+    if not sane:
+        raise QsgmError(f"{path}: 'views' or 'scale' is damaged; {_ADVICE}")
+    return replace(
+        description,
+        scale=scale,
+        views=views,
+        decision=None if decision is None else Decision.from_json(decision, str(path)),
+        made=manifest["made"],
+    )
+
+
+def _view(folder: Path, entry: Mapping[str, Any]) -> View:
+    path = folder / str(entry["file"])
+    if path.parent != folder or not path.is_file() or _sha256(path.read_bytes()) != entry["sha256"]:
+        raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    x, y = (float(value) for value in entry["center_px"])
+    if not (0 <= x <= PATCH_PX and 0 <= y <= PATCH_PX):
+        raise ValueError(f"`center_px` must lie in the patch, got {(x, y)}")
+    image, mask = decode_patch(path.read_bytes(), path)
+    patch = Patch(image, mask, (x, y), bool(entry["cut_out"]))
+    return View(patch, float(entry["turn_rad"]), bool(entry["whole"]))
+
+
+def _as_detection(sighting: Sighting) -> Detection:
+    """By the patch, or, where that is weak, the place that the network is to look at again."""
+    nothing = Detection(
+        sighting.quality >= FOUND_FROM,
+        sighting.quality,
+        sighting.cell_px if sighting.weak else sighting.center_px,
+        (0.0, 0.0),
+        sighting.angle_deg,
+    )
+    return nothing if sighting.weak else _moved(nothing, sighting)
+
+
+def _moved(place: Detection, sighting: Sighting) -> Detection:
+    """The same place with centre and turn as the patch lies there."""
+    return replace(
+        place,
+        center_px=sighting.center_px,
+        angle_deg=sighting.angle_deg,
+        full_angle_deg=sighting.full_angle_deg,
+        full_angle_confidence=sighting.confidence,
+        refined_by="patch",
+    )
+
+
+def _as_place(found: Detection) -> Place:
+    return Place(found.center_px, found.quality, found.angle_deg, found.full_angle_deg)
+
+
+def _around(heatmap: NDArray[np.float32], cell: tuple[int, int]) -> NDArray[np.float32]:
+    """A heatmap (3, rows, cols) with no quality but around a cell."""
+    row, col = cell
+    near = slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+    alone = heatmap.copy()
+    alone[0] = 0
+    alone[0][near] = heatmap[0][near]
+    return alone
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,1 @@
+"""Drawn objects, tables and scenes: what the grasping task is meta-trained and judged on."""

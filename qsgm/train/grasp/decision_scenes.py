@@ -1,0 +1,156 @@
+"""Drawn objects, taught in torch as the device teaches them, and what is then judged in scenes."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from qsgm.grasp.judge import Appearance, judge
+from qsgm.grasp.patch import cut_patch
+from qsgm.train.grasp.decision import JudgedScene
+from qsgm.train.grasp.drawing.scenes import DrawnScene
+from qsgm.train.grasp.episodes import CENTER_PX, USUAL, Episode, EpisodeMaker
+from qsgm.train.model.graspnet import (
+    KERNELS,
+    LAYERS,
+    POOL,
+    POOL_AFTER_LAYER,
+    STRIDES,
+    GraspNet,
+    Loss,
+    normalize,
+)
+from qsgm.train.model.local import LayerState
+from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune
+from qsgm.train.pretraining.tasks import Task, TaskSet, make_task, shipped_things
+
+
+@dataclass(frozen=True)
+class DecisionScenesConfig:
+    """How many objects and scenes the decision is made on."""
+
+    episodes: int = 240
+    scenes: int = 8  # with the object, and as many without it
+    crops: int = 1000
+    support: int = 800
+    epochs: int = 20
+    tasks_at_once: int = 8
+
+
+def judged_scenes(
+    net: GraspNet,
+    rule: UpdateRule,
+    start: Sequence[tuple[Tensor, Tensor]],
+    config: DecisionScenesConfig,
+    seed: int,
+    after_episode: Callable[[], None],
+) -> list[JudgedScene]:
+    """Teach every episode's object, and judge the candidates of all its scenes.
+
+    Args:
+        net: in eval mode; its frozen layers are used.
+        rule: by which the last layers learn.
+        start: of these layers, batchnorm folded.
+        config: sizes.
+        seed: of the episodes.
+        after_episode: told about each.
+    """
+    maker = EpisodeMaker(seed, USUAL)
+    judged: list[JudgedScene] = []
+    for first in range(0, config.episodes, config.tasks_at_once):
+        numbers = range(first, min(first + config.tasks_at_once, config.episodes))
+        episodes = [maker.draw(number, config.scenes, without=True) for number in numbers]
+        taught = _teach(net, rule, start, episodes, config, seed)
+        for number, episode, states in zip(numbers, episodes, taught, strict=True):
+            judged += _judge_all(number, episode, net, states, rule.loss)
+            after_episode()
+    return judged
+
+
+def _teach(
+    net: GraspNet,
+    rule: UpdateRule,
+    start: Sequence[tuple[Tensor, Tensor]],
+    episodes: Sequence[Episode],
+    config: DecisionScenesConfig,
+    seed: int,
+) -> Iterator[list[LayerState]]:
+    """The tuned layers of every episode."""
+    tasks = [_task(net, episode, len(start), config, rule.loss, seed) for episode in episodes]
+    together = TaskSet(
+        torch.stack([task.features for task in tasks]),
+        torch.stack([task.labels for task in tasks]),
+        config.support,
+    )
+    *_, states = fine_tune(rule, start, together, config.epochs, seed)
+    for i in range(len(tasks)):
+        yield [_of_task(state, i) for state in states]
+
+
+def _task(
+    net: GraspNet,
+    episode: Episode,
+    tuned: int,
+    config: DecisionScenesConfig,
+    loss: Loss,
+    seed: int,
+) -> Task:
+    rng = np.random.default_rng(seed)
+    frame = episode.demonstration.image
+    return make_task(
+        net,
+        frame,
+        rng,
+        last_frozen=LAYERS - tuned,
+        count=config.crops,
+        loss=loss,
+        things=shipped_things(),
+    )
+
+
+def _judge_all(
+    number: int,
+    episode: Episode,
+    net: GraspNet,
+    states: Sequence[LayerState],
+    loss: Loss,
+) -> Iterator[JudgedScene]:
+    appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
+
+    def judged(scene: DrawnScene, center_px: tuple[float, float] | None) -> JudgedScene:
+        seen = heatmap_of(net, states, scene.image, loss)
+        found = judge(appearance, scene.image, seen)
+        return JudgedScene(number, center_px, tuple(found))
+
+    for scene in episode.scenes:
+        yield judged(scene, scene.center_px)
+    for scene in episode.without:
+        yield judged(scene, None)
+
+
+@torch.no_grad()
+def heatmap_of(
+    net: GraspNet, states: Sequence[LayerState], frame: NDArray[np.uint8], loss: Loss
+) -> NDArray[np.float32]:
+    """Quality, sine and cosine (3, rows, cols) of a frame (H, W, 3) by one task's tuned layers."""
+    first = LAYERS - len(states) + 1
+    x = net.between(normalize(torch.from_numpy(frame[None])), 1, first - 1)
+    for layer, state in enumerate(states, start=first):
+        kernel, stride = KERNELS[layer - 1], STRIDES[layer - 1]
+        weight = state.weight[0].view(kernel, kernel, x.shape[1], -1).permute(3, 2, 0, 1)
+        x = F.conv2d(x, weight, state.bias[0], stride)
+        x = x if layer == LAYERS else F.relu(x)
+        x = F.avg_pool2d(x, POOL, stride=1) if layer == POOL_AFTER_LAYER else x
+    heatmap: NDArray[np.float32] = loss.activate(x)[0].numpy()
+    return heatmap
+
+
+def _of_task(state: LayerState, i: int) -> LayerState:
+    one = slice(i, i + 1)
+    return LayerState(
+        state.weight[one], state.bias[one], state.weight_momentum[one], state.bias_momentum[one]
+    )

@@ -1,0 +1,1 @@
+"""The network and its SGMs in torch: layers, local updates, batchnorm folded."""

@@ -1,0 +1,105 @@
+"""What a baseline is given of a batch, and what it has to yield.
+
+A step runs all tuned layers forward, asks the baseline for the gradient on every layer's
+activation, and updates all layers. Some baselines need no more than a layer's own activation and
+the label, some the error at the outputs, some the weights behind: all of it is in reach here, and
+each module says what it uses. Since every layer's activation comes from its weights before the
+update, a step equals :func:`qsgm.train.model.local.local_step`, where layers update one by one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from qsgm.train.model.graspnet import LAYERS, Loss
+from qsgm.train.model.local import (
+    LayerState,
+    columns,
+    layer_forward,
+    loss_gradient,
+    sum_windows,
+    through_activation,
+)
+
+
+@dataclass(frozen=True)
+class ForwardPass:
+    """A batch on its way through the tuned layers; mappings are by layer number, in order."""
+
+    columns: Mapping[int, Tensor]  # (T, B, P, K), what each layer sees of its input
+    before: Mapping[int, Tensor]  # (T, B, P, C), pre-activations
+    activations: Mapping[int, Tensor]  # (T, B, P, C), pooled to P = 1 after layer 4
+    labels: Tensor  # (T, B, 3)
+    output_error: Tensor  # (T, B, 1, 3), gradient of each sample's loss on its raw outputs
+
+    def hidden(self) -> Mapping[int, Tensor]:
+        """The activations of all tuned layers but the last."""
+        return {layer: x for layer, x in self.activations.items() if layer < LAYERS}
+
+
+class Baseline(Protocol):
+    """Where the gradients of the hidden tuned layers come from.
+
+    The last layer's is the loss's own in every system. A baseline that learns or remembers serves
+    for one run; make a new one for the next.
+    """
+
+    def gradients(self, weights: Mapping[int, Tensor], batch: ForwardPass) -> Mapping[int, Tensor]:
+        """Gradient of each sample's loss on every hidden tuned layer's activation.
+
+        Args:
+            weights: (T, K, C) of every tuned layer, as they were in the forward pass.
+            batch: that pass.
+
+        Returns:
+            By layer, in the shape of its activation (T, B, P, C).
+        """
+        ...
+
+
+@torch.no_grad()
+def forward_pass(
+    states: Mapping[int, LayerState], features: Tensor, labels: Tensor, loss: Loss
+) -> ForwardPass:
+    """Run features (T, B, P, C) through the tuned layers and compare with labels (T, B, 3)."""
+    seen: dict[int, Tensor] = {}
+    before: dict[int, Tensor] = {}
+    activations: dict[int, Tensor] = {}
+    x = features
+    for layer, state in states.items():
+        seen[layer] = columns(layer, x)
+        before[layer], x = layer_forward(layer, state, seen[layer])
+        activations[layer] = x
+    error = loss_gradient(loss, x, labels[:, :, None])
+    return ForwardPass(seen, before, activations, labels, error)
+
+
+def carry_back(layer: int, weight: Tensor, batch: ForwardPass, gradient: Tensor) -> Tensor:
+    """The gradient (T, B, P, C) on a layer's activation carried back to its input's.
+
+    Args:
+        layer: its number.
+        weight: (T, K, C) or (K, C); its own gives the true gradient.
+        batch: has to hold the activation of the layer before.
+        gradient: on its activation.
+    """
+    dz = through_activation(layer, batch.before[layer], gradient)
+    windows = dz @ weight.transpose(-1, -2).unsqueeze(-3)
+    return sum_windows(layer, windows, batch.activations[layer - 1].shape[2])
+
+
+def carry_back_all(weights: Mapping[int, Tensor], batch: ForwardPass) -> dict[int, Tensor]:
+    """The output error carried back, layer by layer, to every hidden tuned layer's activation."""
+    gradients, gradient = {}, batch.output_error
+    for layer in _last_first(batch):
+        gradient = carry_back(layer, weights[layer], batch, gradient)
+        gradients[layer - 1] = gradient
+    return gradients
+
+
+def _last_first(batch: ForwardPass) -> Sequence[int]:
+    """The tuned layers that have a tuned layer before them, from the last on."""
+    return list(batch.activations)[:0:-1]

@@ -1,0 +1,111 @@
+"""Pretraining, second stage: SGMs regress true gradients along backpropagation runs.
+
+Supervised and quick. Alone it is not enough: errors that do not average out lead the tuned layers
+where no backpropagation run went, which the third stage, MAML, repairs. Started from random SGMs
+instead, that one mostly meets runs that blew up.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from qsgm.train.model.graspnet import LAYERS, Loss
+from qsgm.train.model.local import LayerState, local_step, true_gradients
+from qsgm.train.model.sgm import Sgm
+from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """Sizes and rates of the second stage."""
+
+    epochs: int = 6
+    record_every: int = 2
+    fit_steps: int = 3000
+    fit_batch: int = 2048
+    peak_rate: float = 1e-2
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What an SGM is to learn: activation (M, C), label (M, 3) -> true gradient (M, C)."""
+
+    activations: Tensor
+    labels: Tensor
+    gradients: Tensor
+
+
+@torch.no_grad()
+def record_examples(
+    tasks: TaskSet,
+    start: Sequence[tuple[Tensor, Tensor]],
+    rates: Sequence[float],
+    loss: Loss,
+    config: MatchingConfig,
+    seed: int,
+) -> dict[int, Examples]:
+    """Run backpropagation on every task and keep what each SGM would have seen."""
+    layers = range(LAYERS + 1 - len(start), LAYERS)
+    seen: dict[int, list[tuple[Tensor, ...]]] = {layer: [] for layer in layers}
+    for chunk in tasks.chunks(8):
+        states = start_states(start, len(chunk))
+        batches = shuffled_batches(chunk.support, config.epochs, seed)
+        for number, rows in enumerate(batches):
+            features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
+            states, activations, gradients = _backprop_step(states, features, labels, rates, loss)
+            if number % config.record_every == 0:
+                for layer in layers:
+                    seen[layer].append((activations[layer], labels, gradients[layer]))
+    return {layer: _stack(parts) for layer, parts in seen.items()}
+
+
+def fit_sgm(
+    sgm: Sgm,
+    examples: Examples,
+    config: MatchingConfig,
+    seed: int,
+    after_step: Callable[[], None],
+) -> Sgm:
+    """Least squares on the true gradients (paper section 4.2: l2), scaled to unit size."""
+    generator = torch.Generator().manual_seed(seed)
+    size = examples.gradients.square().mean().sqrt()
+    optimizer = torch.optim.Adam(sgm.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, config.peak_rate, total_steps=config.fit_steps
+    )
+    sgm.train()
+    for _ in range(config.fit_steps):
+        rows = torch.randint(len(examples.labels), (config.fit_batch,), generator=generator)
+        guess = sgm(examples.activations[rows, :, None, None], examples.labels[rows])[:, :, 0, 0]
+        loss = ((guess - examples.gradients[rows]) / size).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        after_step()
+    return sgm.eval()
+
+
+def _backprop_step(
+    states: list[LayerState], features: Tensor, labels: Tensor, rates: Sequence[float], loss: Loss
+) -> tuple[list[LayerState], dict[int, Tensor], dict[int, Tensor]]:
+    """One step on true gradients; also every layer's activation and gradient."""
+    gradients = true_gradients(states, features, labels, loss)
+    activations: dict[int, Tensor] = {}
+
+    def gradient_of(layer: int, activation: Tensor, _: Tensor) -> Tensor:
+        activations[layer] = activation
+        return gradients[layer]
+
+    rate_tensors = [torch.tensor(rate) for rate in rates]
+    states = local_step(states, features, labels, rate_tensors, gradient_of, momentum=0.9)
+    return states, activations, gradients
+
+
+def _stack(parts: list[tuple[Tensor, ...]]) -> Examples:
+    activations, labels, gradients = (
+        torch.cat([part[i].flatten(0, -2) for part in parts]) for i in range(3)
+    )
+    return Examples(activations, labels, gradients)

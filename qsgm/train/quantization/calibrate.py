@@ -1,0 +1,218 @@
+"""Ranges for the int8 SGMs, from what they see along whole fine-tuning runs.
+
+Activations move while layers train, so ranges are taken from the first step to the last, on every
+calibration frame, channel by channel. Values are looked at and dropped: one frame is in memory at
+a time, and of each run only its current step.
+
+Which calibrator suits a layer is not known beforehand. The default tries them all on some of the
+frames, with ranges from the others, and takes for each layer the one whose int8 gradients point
+most nearly where the float ones do.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from qsgm.errors import QsgmError
+from qsgm.fidelity import cosine
+from qsgm.sgm.float import FloatArray
+from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
+from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
+from qsgm.train.quantization.calibration_runs import (
+    EPOCHS,
+    RunPlan,
+    Trainee,
+    float_moment,
+    measured_plans,
+    run,
+    run_plans,
+)
+from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+
+# Not a calibrator: for each layer the best of them.
+AUTO = "auto"
+HELD_OUT_EVERY = 4
+EQUAL_COSINE = 1e-5
+
+# layer: calibrator: the SGM
+Candidates = Mapping[int, Mapping[str, QuantizedSgm]]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Every SGM's ranges, whose they are, and why; all by layer."""
+
+    ranges: dict[int, SgmRanges]
+    chosen: dict[int, str]  # calibrator
+    # calibrator: mean cosine of int8 to float gradients; empty where none was to be chosen
+    cosines: dict[int, dict[str, float]]
+    # Frames that the cosines were measured on and the ranges then compared were not taken from;
+    # 0: both were all frames.
+    held_out: int
+
+
+def calibrate(
+    trainee: Trainee,
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int = EPOCHS,
+    calibrator: str = AUTO,
+    activation_bits: ActivationBits = 16,
+) -> Calibration:
+    """Fine-tune on every frame with the float SGMs and take each SGM's ranges on the way.
+
+    Layers are tuned by twos and by threes: the SGM behind layer 5 serves both. Where SGMs stand
+    behind layers 1 to 3 all layers are tuned as well, in short runs, see
+    :data:`qsgm.train.quantization.calibration_runs.MAP_EPOCHS`.
+
+    Args:
+        trainee: what to fine-tune.
+        frames: the calibration set.
+        seed: of crops and batches.
+        watch: told about progress.
+        epochs: length of a whole run.
+        calibrator: one of :data:`qsgm.sgm.ranges.CALIBRATORS`, or :data:`AUTO`: for each layer
+            the one that does best on frames held out.
+        activation_bits: of the int8 SGMs.
+
+    Raises:
+        QsgmError: there is no such calibrator, a run diverged, or a frame cannot be used.
+    """
+    refuse_unknown(calibrator)
+    held_out = held_out_frames(len(frames)) if calibrator == AUTO else range(0)
+    everything, compared = observe(trainee, frames, seed, watch, epochs, held_out)
+    levels = 2**activation_bits
+    if calibrator == AUTO:
+        candidates = quantize_all(trainee, compared, activation_bits)
+        judges = held_out or range(len(frames))
+        cosines = judge(trainee, candidates, frames, judges, seed, watch, epochs)
+        chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
+    else:
+        cosines = {layer: {} for layer in trainee.sgms}
+        chosen = dict.fromkeys(trainee.sgms, calibrator)
+    ranges = {layer: everything[layer].ranges(chosen[layer], levels) for layer in trainee.sgms}
+    return Calibration(ranges, chosen, cosines, len(held_out))
+
+
+def refuse_unknown(calibrator: str) -> None:
+    """Raise QsgmError for a name that is no calibrator's."""
+    if calibrator not in (AUTO, *CALIBRATORS):
+        raise QsgmError(
+            f"there is no calibrator {calibrator!r}; take one of {', '.join((AUTO, *CALIBRATORS))}"
+        )
+
+
+def held_out_frames(count: int) -> range:
+    """Every fourth; of fewer frames than that, none can be spared."""
+    return range(HELD_OUT_EVERY - 1, count, HELD_OUT_EVERY)
+
+
+def observe(
+    trainee: Trainee,
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int,
+    held_out: range,
+) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers]]:
+    """What each SGM sees in the runs on all frames, and on those that are not held out."""
+    everything, compared = (
+        {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
+    )
+    for i in range(len(frames)):
+        watch("calibrate", i, len(frames))
+        for layer, seen in observe_frame(trainee, frames[i], [seed, i], epochs).items():
+            everything[layer].merge(seen)
+            if i not in held_out:
+                compared[layer].merge(seen)
+    watch("calibrate", len(frames), len(frames))
+    return everything, compared
+
+
+def observe_frame(
+    trainee: Trainee, demonstration: Demonstration, seed: list[int], epochs: int
+) -> dict[int, SgmObservers]:
+    """What each SGM sees in the runs on one frame."""
+    observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
+    for plan in run_plans(trainee.checkpoint.most_layers, epochs):
+
+        def gradient(layer: int, seen: FloatArray, plan: RunPlan = plan) -> FloatArray:
+            result, hidden = trainee.float_trace(layer, seen)
+            if layer in plan.measured:
+                observers[layer].update(seen, hidden)
+            return result
+
+        for _ in run(trainee, demonstration, plan, seed, gradient):
+            pass
+    return observers
+
+
+def quantize_all(
+    trainee: Trainee, seen: Mapping[int, SgmObservers], activation_bits: ActivationBits
+) -> Candidates:
+    """The int8 SGMs by every calibrator's ranges."""
+    levels = 2**activation_bits
+    return {
+        layer: {
+            name: quantize_sgm(sgm, seen[layer].ranges(name, levels), activation_bits)
+            for name in CALIBRATORS
+        }
+        for layer, sgm in trainee.sgms.items()
+    }
+
+
+def judge(
+    trainee: Trainee,
+    candidates: Candidates,
+    frames: CalibrationSet,
+    judges: range,
+    seed: int,
+    watch: Watch,
+    epochs: int,
+) -> dict[int, dict[str, float]]:
+    """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.
+
+    The float SGMs drive the runs, so that all calibrators are asked the same.
+    """
+    cosines: dict[int, dict[str, list[float]]] = {
+        layer: {name: [] for name in CALIBRATORS} for layer in candidates
+    }
+    for done, i in enumerate(judges):
+        watch("choose", done, len(judges))
+        for plan in measured_plans(trainee, epochs):
+            for layer, name, value in judge_run(trainee, candidates, frames[i], plan, [seed, i]):
+                cosines[layer][name].append(value)
+    watch("choose", len(judges), len(judges))
+    return {
+        layer: {name: float(np.mean(values)) for name, values in by_name.items()}
+        for layer, by_name in cosines.items()
+    }
+
+
+def judge_run(
+    trainee: Trainee,
+    candidates: Candidates,
+    demonstration: Demonstration,
+    plan: RunPlan,
+    seed: list[int],
+) -> Iterator[tuple[int, str, float]]:
+    """Every now and then along one run, each calibrator's cosine at each SGM it is there for."""
+
+    def driver(layer: int, seen: FloatArray) -> FloatArray:
+        return trainee.float_trace(layer, seen)[0]
+
+    steps = run(trainee, demonstration, plan, seed, driver)
+    for moment in islice(steps, 0, None, plan.measure_every):
+        for layer, (seen, floating) in float_moment(trainee, moment).items():
+            if layer in plan.measured:
+                for name, sgm in candidates[layer].items():
+                    yield layer, name, cosine(integer_forward(sgm, seen)[0], floating)
+
+
+def best_calibrator(cosines: Mapping[str, float]) -> str:
+    """The one with the highest cosine; of equals the first."""
+    best = max(cosines.values())
+    return next(name for name, value in cosines.items() if value >= best - EQUAL_COSINE)

@@ -1,0 +1,100 @@
+"""How faithful int8 SGMs are along whole fine-tuning runs on the calibration set."""
+
+from collections.abc import Iterator, Mapping
+from itertools import islice
+
+import torch
+from torch import Tensor
+
+from qsgm.fidelity import Gradients, LayerFidelity, compare, mean_over_run
+from qsgm.sgm.float import FloatArray
+from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
+from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
+from qsgm.train.quantization.calibration_runs import (
+    EPOCHS,
+    Moment,
+    RunPlan,
+    Trainee,
+    float_moment,
+    measured_plans,
+    passes_of,
+    run,
+)
+from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+
+
+def measure(
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    frames: CalibrationSet,
+    seed: int,
+    watch: Watch,
+    epochs: int = EPOCHS,
+) -> dict[int, LayerFidelity]:
+    """Fidelity of each int8 SGM, mean over runs on every frame.
+
+    Behind layers 4 and 5 it is taken along whole runs of the last three layers, and the int8 SGMs
+    drive them, as on the device: what they see is what they have led to. Behind layers 1 to 3 it is
+    taken along the short runs of all layers, which the float SGMs drive: they are quicker here.
+    """
+    measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
+    for i in range(len(frames)):
+        watch("measure", i, len(frames))
+        for plan in measured_plans(trainee, epochs):
+            for layer, fidelity in measure_run(trainee, int8_sgms, frames[i], plan, [seed, i]):
+                measured[layer].append(fidelity)
+    watch("measure", len(frames), len(frames))
+    return {layer: mean_over_run(values) for layer, values in measured.items()}
+
+
+def measure_run(
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    demonstration: Demonstration,
+    plan: RunPlan,
+    seed: list[int],
+) -> Iterator[tuple[int, LayerFidelity]]:
+    """Every now and then along one run, what the SGMs that it is there for are worth."""
+
+    def driver(layer: int, seen: FloatArray) -> FloatArray:
+        if plan.maps:
+            return trainee.float_trace(layer, seen)[0]
+        return integer_forward(int8_sgms[layer], seen)[0]
+
+    steps = run(trainee, demonstration, plan, seed, driver)
+    for moment in islice(steps, 0, None, plan.measure_every):
+        yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
+
+
+def compare_moment(
+    trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], moment: Moment, layers: range
+) -> dict[int, LayerFidelity]:
+    """Int8, float and true gradients on one batch behind `layers`, as they are at that moment."""
+    true = true_gradients(moment.states, moment.features, moment.labels, trainee.checkpoint.loss)
+    fidelity, passes = {}, passes_of(moment)
+    for layer, (seen, floating) in float_moment(trainee, moment).items():
+        if layer in layers:
+            int8, clipped = integer_forward(int8_sgms[layer], seen)
+            given = (int8, floating, true[layer][0].numpy())
+            updates = (update_from(layer, *passes[layer], gradient) for gradient in given)
+            fidelity[layer] = compare(
+                Gradients(*given),
+                Gradients(*updates),
+                clipped,
+                underflow_fraction(int8_sgms[layer], seen),
+            )
+    return fidelity
+
+
+def update_from(layer: int, windows: Tensor, before: Tensor, gradient: FloatArray) -> FloatArray:
+    """Gradients of a layer's weight and bias, one after the other, from one on its activation.
+
+    Args:
+        layer: its number.
+        windows: of its input, (1, B, P, K).
+        before: its pre-activation, (1, B, P, C).
+        gradient: (B, P', C), each sample's own.
+    """
+    dz = through_activation(layer, before, torch.from_numpy(gradient)[None])
+    parts = weight_gradients(windows, dz)
+    return torch.cat([part.flatten() for part in parts]).numpy()
