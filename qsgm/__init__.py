@@ -22,22 +22,53 @@ from qsgm.errors import QsgmError
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
-    from qsgm.bundle import load_bundle
+    from qsgm.bundle import Bundle, load_bundle
+    from qsgm.fidelity import LayerFidelity
+    from qsgm.grasp.heatmap import Detection, Place
+    from qsgm.grasp.others import Other, other_in
     from qsgm.grasp.source import Demonstration
-    from qsgm.grasp.tuned import load_object
+    from qsgm.grasp.teach import FinetuneResult, finetune
+    from qsgm.grasp.tuned import TunedObject, load_object
+    from qsgm.grasp.verdict import Verdict
     from qsgm.images import read_frame
-    from qsgm.tune.run import finetune
+    from qsgm.network import Layer, Network, conv
+    from qsgm.task import Head, Labelled, Lesson, Task
+    from qsgm.tune.plan import Plan, resolve
+    from qsgm.tune.prepare import Prepared, prepare
+    from qsgm.tune.probe import Probe
+    from qsgm.tune.result import Result
     from qsgm.tune.settings import Settings
 else:
-    # Imported when asked for, since they bring in ONNX Runtime and OpenCV. None of these modules
-    # may have the name of an export: importing it would put the module in the export's place.
+    # Imported when asked for, since they bring in ONNX Runtime and OpenCV.
     _HOME = {
+        "Bundle": "qsgm.bundle",
         "Demonstration": "qsgm.grasp.source",
+        "Detection": "qsgm.grasp.heatmap",
+        "FinetuneResult": "qsgm.grasp.teach",
+        "Head": "qsgm.task",
+        "Labelled": "qsgm.task",
+        "Layer": "qsgm.network",
+        "LayerFidelity": "qsgm.fidelity",
+        "Lesson": "qsgm.task",
+        "Network": "qsgm.network",
+        "Other": "qsgm.grasp.others",
+        "Place": "qsgm.grasp.heatmap",
+        "Plan": "qsgm.tune.plan",
+        "Prepared": "qsgm.tune.prepare",
+        "Probe": "qsgm.tune.probe",
+        "Result": "qsgm.tune.result",
         "Settings": "qsgm.tune.settings",
-        "finetune": "qsgm.tune.run",
+        "Task": "qsgm.task",
+        "TunedObject": "qsgm.grasp.tuned",
+        "Verdict": "qsgm.grasp.verdict",
+        "conv": "qsgm.network",
+        "finetune": "qsgm.grasp.teach",
         "load_bundle": "qsgm.bundle",
         "load_object": "qsgm.grasp.tuned",
+        "other_in": "qsgm.grasp.others",
+        "prepare": "qsgm.tune.prepare",
         "read_frame": "qsgm.images",
+        "resolve": "qsgm.tune.plan",
     }
 
     def __getattr__(name: str) -> object:
@@ -48,12 +79,34 @@ else:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Bundle",
     "Demonstration",
+    "Detection",
+    "FinetuneResult",
+    "Head",
+    "Labelled",
+    "Layer",
+    "LayerFidelity",
+    "Lesson",
+    "Network",
+    "Other",
+    "Place",
+    "Plan",
+    "Prepared",
+    "Probe",
     "QsgmError",
+    "Result",
     "Settings",
+    "Task",
+    "TunedObject",
+    "Verdict",
     "__version__",
+    "conv",
     "finetune",
     "load_bundle",
     "load_object",
+    "other_in",
+    "prepare",
     "read_frame",
+    "resolve",
 ]

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
-from qsgm.grasp.crops import CROP_PX
 
 MAX_SIDE_PX = 4096
 MAX_FILE_BYTES = 200_000_000
-MIN_SIDE_PX = CROP_PX
+MIN_SIDE_PX = 128
 # Room for the object's window and for windows beside it.
-MIN_DEMONSTRATION_SIDE_PX = 2 * CROP_PX
+MIN_DEMONSTRATION_SIDE_PX = 256
 # Standard deviation, in grey levels, of the channel that varies most. A flat picture stays below
 # 1 through JPEG compression; a plain table with an object on it is above 5.
 MIN_CONTRAST_LEVELS = 2.0

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.network import Pair
+
 Array = NDArray[np.float32]
 
 
@@ -11,7 +13,7 @@ def to_step_layout(weight: Array) -> Array:
     return np.ascontiguousarray(weight.transpose(0, 2, 3, 1).reshape(len(weight), -1))
 
 
-def to_conv_layout(weight: Array, kernel: int) -> Array:
-    """(Co, kernel * kernel * Ci) back to (Co, Ci, kernel, kernel)."""
-    windows = weight.reshape(len(weight), kernel, kernel, -1)
+def to_conv_layout(weight: Array, kernel: Pair) -> Array:
+    """(Co, kh * kw * Ci) back to (Co, Ci, kh, kw)."""
+    windows = weight.reshape(len(weight), *kernel, -1)
     return np.ascontiguousarray(windows.transpose(0, 3, 1, 2))

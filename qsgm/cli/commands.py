@@ -44,6 +44,7 @@ from qsgm.cli.options import (
     ThreadsOption,
     TrunkOption,
     parsed_blocks,
+    parsed_center,
     parsed_centers,
     parsed_channels,
     settings_of,
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
     from qsgm.bundle import Bundle
     from qsgm.grasp.others import Other
     from qsgm.grasp.source import Demonstration
-    from qsgm.tune.run import FinetuneResult
+    from qsgm.grasp.teach import FinetuneResult
     from qsgm.tune.settings import Settings
 
 app = typer.Typer()
@@ -80,10 +81,10 @@ def pretrain(
     What was interrupted goes on where it stopped when the same command runs again.
     """
     chosen = {} if hidden is None else {"hidden": parsed_channels(hidden)}
-    host = host_module("qsgm.train.pretraining.pretrain")
-    config, loss = host.PretrainConfig(**chosen), host.Loss(encoding=encoding.value)
+    host = host_module("qsgm.train.grasp.pretrain")
+    config, task = host.PretrainConfig(**chosen), host.DrawnGrasping(encoding=encoding.value)
     with progress() as watch:
-        host.pretrain(output, seed, device.value, watch, config=config, loss=loss)
+        host.pretrain_grasping(task, output, seed, device.value, watch, config)
     if as_json:
         print_json({"output": str(output), "seed": seed, "device": device.value})
     else:
@@ -133,18 +134,13 @@ def fold_and_quantize(
 ) -> None:
     """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
     more = [parsed_blocks(text) for text in blocks or ()]
-    host = host_module("qsgm.train.export")
-    calibration = paths.calibration_folder(calib)
+    host = host_module("qsgm.train.grasp.export")
+    calibration, bits = paths.calibration_folder(calib), int(activation_bits.value)
+    options = host.ExportOptions(
+        blocks=tuple(more), calibrator=calibrator.value, activation_bits=bits
+    )
     with progress() as watch:
-        report = host.fold_and_quantize(
-            checkpoint,
-            calibration,
-            output,
-            watch,
-            blocks=more,
-            calibrator=calibrator.value,
-            activation_bits=int(activation_bits.value),
-        )
+        report = host.fold_and_quantize(checkpoint, calibration, output, watch, options)
     show(report.to_json(), report, as_json)
 
 
@@ -197,20 +193,18 @@ def finetune(
 ) -> None:
     """Tune the network to the object in one frame or several, on the device."""
     from qsgm.files import check_replaceable
+    from qsgm.grasp.report import finetune_json, finetune_report
     from qsgm.grasp.tuned import DESCRIPTION
-    from qsgm.tune.report import finetune_json, finetune_report
 
     tuned, first = tuned_layers(layers, blocks), frames[0]
     centers = parsed_centers(center, len(frames))
-    settings = settings_of(
-        int8, method, tuned, optimizer, epochs, seed, None, threads, blocks, trunk
-    )
+    settings = settings_of(int8, method, tuned, optimizer, epochs, seed, threads, blocks, trunk)
     if recalibrate and int8 is None and settings.method == "sgm":
         settings = replace(settings, precision="int8")  # those are the SGMs that have ranges
-    settings = replace(settings, recalibrate=recalibrate, stream=stream, span_px=span)
+    settings = replace(settings, recalibrate=recalibrate, stream=stream)
     folder = paths.object_folder(first) if output is None else output
     check_replaceable(folder, DESCRIPTION)
-    result = _finetune(frames, centers, others or (), open_bundle(bundle), settings)
+    result = _finetune(frames, centers, others or (), open_bundle(bundle), settings, span)
     name = folder.name if output is None else first.stem
     report = finetune_json(result, name, folder)
     result.save(folder, name)
@@ -244,9 +238,9 @@ def predict(
 ) -> None:
     """Find the tuned object: where it is, how far to move, how far to turn."""
     from qsgm.grasp.pictures import draw_detection
+    from qsgm.grasp.report import detection_table, instances_table, predict_json
     from qsgm.grasp.tuned import load_object
     from qsgm.images import read_frame, write_png
-    from qsgm.tune.report import detection_table, instances_table, predict_json
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
@@ -299,10 +293,10 @@ def fidelity(
 
     chart = None if picture is None else host_module("qsgm.train.fidelity_chart")
     settings = settings_of(
-        int8, MethodName.SGM, layers, optimizer, epochs, seed, center, threads, trunk=trunk
+        int8, MethodName.SGM, layers, optimizer, epochs, seed, threads, trunk=trunk
     )
     settings = replace(settings, probe_every=every)
-    result = _finetune([frame], [settings.center_px], (), open_bundle(bundle), settings)
+    result = _finetune([frame], [parsed_center(center)], (), open_bundle(bundle), settings)
     if not result.probes:
         raise QsgmError(
             f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
@@ -323,13 +317,14 @@ def _finetune(
     others: Sequence[Path],
     bundle: "Bundle",
     settings: "Settings",
+    span_px: float | None = None,
 ) -> "FinetuneResult":
-    from qsgm.tune.run import finetune as run_finetune
+    from qsgm.grasp.teach import finetune as run_finetune
 
     demonstrations = [_demonstration(*one) for one in zip(frames, centers, strict=True)]
     named = [_other(path) for path in others]
     with progress() as watch:
-        return run_finetune(demonstrations, bundle, settings, watch, named)
+        return run_finetune(demonstrations, bundle, settings, watch, named, span_px)
 
 
 def _demonstration(path: Path, center_px: tuple[float, float] | None) -> "Demonstration":

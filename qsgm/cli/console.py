@@ -44,7 +44,7 @@ def show(values: dict[str, Any], table: RenderableType, as_json: bool) -> None:
 
 def print_json(values: dict[str, Any]) -> None:
     """One JSON object on stdout."""
-    from qsgm.tune.report import to_json
+    from qsgm.tables import to_json
 
     typer.echo(to_json(values))
 
@@ -52,7 +52,7 @@ def print_json(values: dict[str, Any]) -> None:
 def write_report(values: dict[str, Any], path: Path | None) -> None:
     """Write the JSON to a file, if one was asked for."""
     from qsgm.files import write_text_atomic
-    from qsgm.tune.report import to_json
+    from qsgm.tables import to_json
 
     if path is not None:
         write_text_atomic(path, to_json(values) + "\n")

@@ -13,7 +13,7 @@ from qsgm.errors import QsgmError
 if TYPE_CHECKING:
     from qsgm.bench.calibration import Variant
     from qsgm.blocks import Blocks
-    from qsgm.bundle import Precision
+    from qsgm.manifest import Precision
     from qsgm.tune.settings import Settings
 
 LARGEST_HIDDEN = 1024
@@ -169,7 +169,6 @@ def settings_of(
     optimizer: OptimizerChoice | None,
     epochs: int,
     seed: int,
-    center: str | None,
     threads: int,
     blocks: str | None = None,
     trunk: TrunkChoice | None = None,
@@ -188,7 +187,6 @@ def settings_of(
         optimizer=None if optimizer is None else optimizer.value,
         epochs=epochs,
         seed=seed,
-        center_px=parsed_center(center),
         threads=threads,
     )
 

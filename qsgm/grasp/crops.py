@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.grasp.angles import AngleEncoding, encode_angle
+from qsgm.grasp.network import CROP_PX
 
-CROP_PX = 128
 HALF_CROP_PX = CROP_PX // 2
 TRAIN_CROPS = 800
 VALIDATION_CROPS = 200

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.grasp.crops import CROP_PX, HALF_CROP_PX
+from qsgm.grasp.crops import HALF_CROP_PX
+from qsgm.grasp.network import CROP_PX
 
 FILE = "distractors.png"
 TILE_PX = 128

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.grasp.angles import AngleEncoding, decode_angle, wrap_half_turn
-from qsgm.grasp.crops import CROP_PX, HALF_CROP_PX, POSITIVE_JITTER_PX
+from qsgm.grasp.crops import HALF_CROP_PX, POSITIVE_JITTER_PX
+from qsgm.grasp.network import CROP_PX
 
 CELL_PX = 16
 # The second look: windows this far apart, with centres up to this far from the first estimate.

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.angles import round_degrees
-from qsgm.grasp.crops import CROP_PX, HALF_CROP_PX
+from qsgm.grasp.crops import HALF_CROP_PX
 from qsgm.grasp.heatmap import CELL_PX, Detection
+from qsgm.grasp.network import CROP_PX
 
 Picture = NDArray[np.uint8]
 Color = tuple[int, int, int]  # BGR

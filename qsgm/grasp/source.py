@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.clutter import Addition, ClutterPlan, add_clutter, dimmed, joined, plan_clutter
-from qsgm.grasp.crops import CROP_PX, CROPS, CropPlan, plan_crops, widened, windows_of
+from qsgm.grasp.crops import CROPS, CropPlan, plan_crops, widened, windows_of
 from qsgm.grasp.distractors import Distractors
+from qsgm.grasp.network import CROP_PX
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.bundle import NETWORK, read_manifest, require_keys
 from qsgm.errors import QsgmError
 from qsgm.files import new_folder
 from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
-from qsgm.grasp.crops import CROP_PX
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
 from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
 from qsgm.grasp.heatmap import Detection, Place, locate, refine
 from qsgm.grasp.judge import JUDGED, cell_center
 from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
+from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.others import Other
 from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
 from qsgm.grasp.shown import View
+from qsgm.manifest import NETWORK, read_description, require_keys
 from qsgm.runtime import open_session, running
 
 FORMAT = "qsgm-object"
@@ -283,7 +283,7 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     Raises:
         QsgmError: it is missing, altered, or something else.
     """
-    manifest = read_manifest(folder, FORMAT, VERSIONS, _COMMAND)
+    manifest = read_description(folder / DESCRIPTION, FORMAT, VERSIONS, _COMMAND)
     first = manifest["version"] == VERSIONS[0]
     require_keys(folder / DESCRIPTION, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
     description = ObjectDescription(manifest["name"], manifest["encoding"], manifest["offset_rad"])

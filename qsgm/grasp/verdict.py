@@ -4,11 +4,12 @@ The crops that took no part in training say how well the network does with other
 what the object looks like says what the second opinion is worth.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 from qsgm.grasp.likeness import Likeness
-from qsgm.tune.prepare import Accuracy
+from qsgm.task import Scores
 
 LEAST_DETECTION = 0.9
 # Of other things; those that the network proposes in spite of that, the patch has to refuse.
@@ -43,7 +44,7 @@ class Verdict:
 
 
 def verdict_on(
-    tuned: Accuracy, untouched: Accuracy, strength: float, like: Likeness, *, trained: bool = True
+    tuned: Scores, untouched: Scores, strength: float, like: Likeness, *, trained: bool = True
 ) -> Verdict:
     """Judge a run.
 
@@ -54,26 +55,27 @@ def verdict_on(
         like: what the patch could be taken for.
         trained: whether there was a run at all.
     """
+    detection, before = _score(tuned, "detection_accuracy"), _score(untouched, "detection_accuracy")
     reasons = [*_of_crops(tuned), *_of_angle(tuned, strength, like), *_of_patch(like)]
-    if trained and tuned.detection_accuracy <= untouched.detection_accuracy < NEARLY_ALL:
+    if trained and detection <= before < NEARLY_ALL:
         reasons.append(
-            f"tuning made it no better than untouched (detection {tuned.detection_accuracy:.3f}, "
-            f"before {untouched.detection_accuracy:.3f}): check that the object is at the frame's "
+            f"tuning made it no better than untouched (detection {detection:.3f}, "
+            f"before {before:.3f}): check that the object is at the frame's "
             "centre, or pass --center"
         )
     return Verdict(tuple(reasons), tuple(_notes(tuned, like)))
 
 
-def _of_crops(tuned: Accuracy) -> list[str]:
+def _of_crops(tuned: Scores) -> list[str]:
     """What detection on held-out crops says against it."""
-    found = []
-    if tuned.detection_accuracy < LEAST_DETECTION:
+    found, detection = [], _score(tuned, "detection_accuracy")
+    if detection < LEAST_DETECTION:
         found.append(
-            f"only {_percent(tuned.detection_accuracy)} of the held-out crops are told right: tune "
+            f"only {_percent(detection)} of the held-out crops are told right: tune "
             "longer with --epochs, show the object on another table, or from more sides in several "
             "frames"
         )
-    told = tuned.told_apart
+    told = tuned["told_apart"]
     if told is not None and told < LEAST_TOLD_APART:
         found.append(
             f"{_percent(1 - told)} of other things are taken for it: name those that lie beside it "
@@ -82,14 +84,12 @@ def _of_crops(tuned: Accuracy) -> list[str]:
     return found
 
 
-def _of_angle(tuned: Accuracy, strength: float, like: Likeness) -> list[str]:
+def _of_angle(tuned: Scores, strength: float, like: Likeness) -> list[str]:
     has_angle = strength >= LEAST_STRENGTH and not like.round
-    if not has_angle or tuned.angle_mae_deg <= LARGEST_ANGLE_DEG:
+    error = _score(tuned, "angle_mae_deg")
+    if not has_angle or error <= LARGEST_ANGLE_DEG:
         return []
-    return [
-        f"its turn is off by {tuned.angle_mae_deg:.0f} degrees on average: tune longer with "
-        "--epochs"
-    ]
+    return [f"its turn is off by {error:.0f} degrees on average: tune longer with --epochs"]
 
 
 def _of_patch(like: Likeness) -> list[str]:
@@ -101,7 +101,7 @@ def _of_patch(like: Likeness) -> list[str]:
     ]
 
 
-def _notes(tuned: Accuracy, like: Likeness) -> list[str]:
+def _notes(tuned: Scores, like: Likeness) -> list[str]:
     notes = []
     if like.featureless:
         notes.append("it has hardly any markings, so things of its shape may be taken for it")
@@ -109,10 +109,16 @@ def _notes(tuned: Accuracy, like: Likeness) -> list[str]:
         notes.append("it looks the same at every turn, so its turn means nothing")
     elif like.same_both_ways:
         notes.append("it looks the same both ways round, so turns are told modulo 180 degrees")
-    if tuned.told_apart is None:
+    if tuned["told_apart"] is None:
         notes.append("the bundle has no other things, so nothing is known of telling it apart")
     return notes
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
+
+
+def _score(scores: Scores, name: str) -> float:
+    """A score that there always is."""
+    value = scores[name]
+    return math.nan if value is None else value

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.network import ONE, Pair
 from qsgm.weights import to_step_layout
 
 FloatArray = NDArray[np.float32]
@@ -26,38 +27,48 @@ class FoldedSgm:
     """The SGM behind layer `layer`: convolutions with ReLU between."""
 
     layer: int
+    side: Pair  # of the maps behind that layer
     convs: tuple[FoldedConv, ...]
 
     @property
-    def kernel(self) -> int:
-        """Side of all its windows: 3 behind layers 1 to 3, where maps are, else 1."""
-        return int(self.convs[0].weight.shape[2])
+    def kernel(self) -> Pair:
+        """Sides of all its windows: 3 where maps are, else 1."""
+        height, width = self.convs[0].weight.shape[2:]
+        return height, width
+
+    @property
+    def labels(self) -> int:
+        """Numbers of a label, which are the last inputs."""
+        return int(self.convs[0].weight.shape[1]) - len(self.convs[-1].bias)
 
 
-def padded_windows(x: NDArray[Number], kernel: int, frame: NDArray[Any]) -> NDArray[Number]:
-    """Every position's window (N, P, kernel * kernel * C) of square maps (N, P, C).
+def padded_windows(
+    x: NDArray[Number], side: Pair, kernel: Pair, frame: NDArray[Any]
+) -> NDArray[Number]:
+    """Every position's window (N, P, kh * kw * C) of maps (N, P, C) of this size.
 
     Around the maps every position holds `frame` (C,). For 1x1 they are returned as they are.
     """
-    if kernel == 1:
+    if kernel == ONE:
         return x
     count, positions, channels = x.shape
-    side, pad = round(positions**0.5), kernel // 2
-    framed = np.tile(frame.astype(x.dtype), (count, side + 2 * pad, side + 2 * pad, 1))
-    framed[:, pad:-pad, pad:-pad] = x.reshape(count, side, side, channels)
-    windows = np.lib.stride_tricks.sliding_window_view(framed, (kernel, kernel), axis=(1, 2))
+    (height, width), (up, left) = side, (kernel[0] // 2, kernel[1] // 2)
+    framed = np.tile(frame.astype(x.dtype), (count, height + 2 * up, width + 2 * left, 1))
+    framed[:, up : up + height, left : left + width] = x.reshape(count, height, width, channels)
+    windows = np.lib.stride_tricks.sliding_window_view(framed, kernel, axis=(1, 2))
     return windows.transpose(0, 1, 2, 4, 5, 3).reshape(count, positions, -1)
 
 
-def float_product(conv: FoldedConv, x: FloatArray) -> FloatArray:
-    """A padded convolution of square maps (B, P, I): (B, P, O)."""
-    windows = padded_windows(x, conv.weight.shape[2], np.zeros(x.shape[2], np.float32))
+def float_product(conv: FoldedConv, side: Pair, x: FloatArray) -> FloatArray:
+    """A padded convolution of maps (B, P, I) of this size: (B, P, O)."""
+    height, width = conv.weight.shape[2:]
+    windows = padded_windows(x, side, (height, width), np.zeros(x.shape[2], np.float32))
     flat = windows.reshape(-1, windows.shape[2]) @ to_step_layout(conv.weight).T + conv.bias
     return flat.reshape(*x.shape[:2], -1)
 
 
-# (convolution, maps (B, P, I)) -> maps (B, P, O)
-Product = Callable[[FoldedConv, FloatArray], FloatArray]
+# (convolution, sides of maps, maps (B, P, I)) -> maps (B, P, O)
+Product = Callable[[FoldedConv, Pair, FloatArray], FloatArray]
 
 
 def float_trace(
@@ -66,6 +77,6 @@ def float_trace(
     """An SGM in float: inputs (B, P, Ci) to gradient (B, P, C) and hidden tensors (B, P, H)."""
     x, hidden = seen, []
     for conv in sgm.convs[:-1]:
-        x = np.maximum(product(conv, x), 0)
+        x = np.maximum(product(conv, sgm.side, x), 0)
         hidden.append(x)
-    return product(sgm.convs[-1], x), hidden
+    return product(sgm.convs[-1], sgm.side, x), hidden

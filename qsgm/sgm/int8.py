@@ -17,7 +17,7 @@ Every channel has a scale of its own, and none of them costs anything at run tim
 4. Of 16 bits, three are headroom: ranges are widened to eight times what calibration saw, so that
    activations unlike any in the calibration set do not clip.
 
-Behind layers 1 to 3 kernels are padded, so that zero needs a code of its own: there [low, high] is
+Where SGMs see maps kernels are padded, so that zero needs a code of its own: there [low, high] is
 widened until it has one (:func:`with_zero`). Weights are in their windows' order, (kh, kw, I).
 """
 
@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.network import ONE, Pair, area
 from qsgm.sgm.float import FloatArray, FoldedSgm, padded_windows
 from qsgm.weights import to_step_layout
 
@@ -50,10 +51,6 @@ SMALLEST_SCALE = 1e-30
 CLIP_TOLERANCE_STEPS = 0.5
 # Closer to 0 than half a step, an input is rounded to it.
 UNDERFLOW_STEPS = 0.5
-# The last inputs of every SGM: quality, sine and cosine of the label, whose range is known.
-LABEL_LOW = np.array([0, -1, -1], np.float32)
-LABEL_HIGH = np.array([1, 1, 1], np.float32)
-LABELS = len(LABEL_LOW)
 
 Float64Array = NDArray[np.float64]
 
@@ -81,12 +78,12 @@ CODES: dict[ActivationBits, Codes] = {
 class SgmRanges:
     """What calibration saw of one SGM: the span of each input and hidden channel."""
 
-    input_low: FloatArray  # (Ci,), the last three of the label
+    input_low: FloatArray  # (Ci,), the last ones of the label
     input_high: FloatArray  # (Ci,)
     hidden_high: tuple[FloatArray, ...]  # (H,) of each hidden tensor, after ReLU
 
-    def widened(self, headroom: int) -> "SgmRanges":
-        """The activation's and the hidden channels' ranges so many times as wide.
+    def widened(self, headroom: int, labels: int) -> "SgmRanges":
+        """Ranges so many times as wide, but for the label's.
 
         They start at zero then, or below, and no channel has less than the typical one: where there
         are codes to spare, a channel that calibration saw silent or quiet may become loud.
@@ -94,8 +91,8 @@ class SgmRanges:
         if headroom == 1:
             return self
         low, high = self.input_low.copy(), self.input_high.copy()
-        low[:-LABELS] = headroom * np.minimum(low[:-LABELS], 0)
-        high[:-LABELS] = headroom * at_least_typical(high[:-LABELS])
+        low[:-labels] = headroom * np.minimum(low[:-labels], 0)
+        high[:-labels] = headroom * at_least_typical(high[:-labels])
         hidden = tuple(headroom * at_least_typical(tensor) for tensor in self.hidden_high)
         return SgmRanges(low, high, hidden)
 
@@ -130,7 +127,8 @@ class QuantizedSgm:
     """The SGM behind layer `layer`, ready for integers: code = round((x - low) * gain)."""
 
     layer: int
-    kernel: int  # side of all its windows
+    side: Pair  # of the maps behind that layer
+    kernel: Pair  # of all its windows
     bits: ActivationBits  # of inputs and hidden tensors
     input_low: FloatArray  # (Ci,)
     input_gain: FloatArray  # (Ci,), codes per unit
@@ -165,10 +163,10 @@ def quantize_sgm(
     """
     check_ranges(sgm, seen)
     codes = CODES[bits]
-    ranges = seen.widened(codes.headroom)
+    ranges = seen.widened(codes.headroom, sgm.labels)
     low = ranges.input_low.astype(np.float32)
     span = live_span(ranges.input_high.astype(np.float64) - low)
-    if sgm.kernel > 1:
+    if sgm.kernel != ONE:
         low, span = with_zero(low, span, codes.top)
     # The weights absorb the very gains that the graph will use, rounded to float32 as they are.
     gain = (codes.top / span).astype(np.float32)
@@ -176,7 +174,9 @@ def quantize_sgm(
     steps = [1 / gain.astype(np.float64)]
     steps += [live_span(high.astype(np.float64)) / codes.top for high in ranges.hidden_high]
     products = quantize_products(sgm, low, steps, codes, weight_bits)
-    return QuantizedSgm(sgm.layer, sgm.kernel, bits, low, gain, products, *dead_channels(seen))
+    return QuantizedSgm(
+        sgm.layer, sgm.side, sgm.kernel, bits, low, gain, products, *dead_channels(seen)
+    )
 
 
 def quantize_products(
@@ -193,7 +193,7 @@ def quantize_products(
     """
     weights = [to_step_layout(conv.weight).astype(np.float64) for conv in sgm.convs]
     biases = [conv.bias.astype(np.float64) for conv in sgm.convs]
-    taps = sgm.kernel**2  # a window holds every channel so many times
+    taps = area(sgm.kernel)  # a window holds every channel so many times
     biases[0] += weights[0] @ np.tile(low.astype(np.float64), taps)
     high_steps = [np.tile(codes.high_step * step, taps) for step in steps]
     # The gradient stays what it is.
@@ -291,7 +291,7 @@ def constants(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
     if q.bits == 16:
         named |= {"low_step": np.array(1, np.float32), "low_zero": np.array(HALF_PLANE, np.uint8)}
     for i, product in enumerate(q.products):
-        named |= product_constants(i, product, q.kernel**2, np.float32(1))
+        named |= product_constants(i, product, area(q.kernel), np.float32(1))
     return {f"sgm{q.layer}/{name}": array for name, array in named.items()}
 
 
@@ -312,7 +312,7 @@ def constants_of_two_planes(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
     }
     for i, product in enumerate(q.products):
         last = product is q.products[-1]
-        named |= product_constants(i, product, q.kernel**2, np.float32(1) if last else step)
+        named |= product_constants(i, product, area(q.kernel), np.float32(1) if last else step)
     return {f"sgm{q.layer}/{name}": array for name, array in named.items()}
 
 
@@ -351,7 +351,7 @@ def integer_forward(q: QuantizedSgm, inputs: FloatArray) -> tuple[FloatArray, fl
 
     Args:
         q: the quantized SGM.
-        inputs: float32 (N, P, Ci): activation and label side by side, at P positions of a square.
+        inputs: float32 (N, P, Ci): activation and label side by side, at P positions.
 
     Returns:
         Gradients float32 (N, P, C), and the fraction of inputs that lay outside their range.
@@ -369,13 +369,15 @@ def integer_trace(
     outside = np.abs(scaled - np.float32(middle)) > reach
     frame = to_planes((0 - q.shifted_low) * q.input_gain, q.bits)
     planes = to_planes(scaled, q.bits)
-    windows = [padded_windows(x, q.kernel, zero) for x, zero in zip(planes, frame, strict=True)]
+    windows = [
+        padded_windows(x, q.side, q.kernel, zero) for x, zero in zip(planes, frame, strict=True)
+    ]
     hidden = []
     for product in q.products[:-1]:
         # ReLU is the clipping at zero: a u8 with zero point 0 holds nothing below it.
         hidden.append(to_planes(integer_product(product, windows), q.bits))
         silence = np.zeros_like(product.bias)
-        windows = [padded_windows(x, q.kernel, silence) for x in hidden[-1]]
+        windows = [padded_windows(x, q.side, q.kernel, silence) for x in hidden[-1]]
     return integer_product(q.products[-1], windows), hidden, float(outside.mean())
 
 

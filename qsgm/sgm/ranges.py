@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
 from qsgm.sgm.float import FloatArray, FoldedSgm
-from qsgm.sgm.int8 import LABEL_HIGH, LABEL_LOW, LABELS, SgmRanges
+from qsgm.sgm.int8 import SgmRanges
 
 BINS = 4096  # per channel; at least half of them lie within the extremes
 # A grid finer than this times the largest magnitude could not be told from float32's own.
@@ -274,6 +274,7 @@ class SgmObservers:
     """Observers of everything in one SGM that gets a range: its activation, its hidden tensors."""
 
     def __init__(self, sgm: FoldedSgm) -> None:
+        self._labels = sgm.labels
         self._activation = Observer(len(sgm.convs[-1].bias))
         self._hidden = [Observer(len(conv.bias)) for conv in sgm.convs[:-1]]
         # The largest value of each tensor, by run.
@@ -281,7 +282,7 @@ class SgmObservers:
 
     def update(self, seen: FloatArray, hidden: list[FloatArray]) -> None:
         """One batch: inputs (B, P, Ci) and hidden tensors (B, P, H), after ReLU."""
-        self._activation.update(seen[..., :-LABELS])
+        self._activation.update(seen[..., : -self._labels])
         for observer, values in zip(self._hidden, hidden, strict=True):
             observer.update(values)
 
@@ -297,8 +298,8 @@ class SgmObservers:
         tensors = [self._activation, *self._hidden]
         return self._tops or [[float(tensor.high.max()) for tensor in tensors]]
 
-    def ranges(self, calibrator: str, levels: int) -> SgmRanges:
-        """What a calibrator makes of it, for so many codes.
+    def ranges(self, calibrator: str, levels: int, labels: Span) -> SgmRanges:
+        """What a calibrator makes of it, for so many codes; labels have a range of their own.
 
         No range is wider than :data:`BLOWN_UP` times a typical run's.
         """
@@ -307,7 +308,7 @@ class SgmObservers:
         limit, *limits = BLOWN_UP * np.median(self.tops(), axis=0).astype(np.float32)
         hidden = (span(observer, levels)[1] for observer in self._hidden)
         return SgmRanges(
-            np.concatenate([np.minimum(low, limit), LABEL_LOW]),
-            np.concatenate([np.minimum(high, limit), LABEL_HIGH]),
+            np.concatenate([np.minimum(low, limit), labels[0]]),
+            np.concatenate([np.minimum(high, limit), labels[1]]),
             tuple(np.minimum(high, top) for high, top in zip(hidden, limits, strict=True)),
         )

@@ -5,25 +5,25 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import BytesIO
 from math import isfinite
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 
-from qsgm.blocks import LAYERS, parse_blocks, single_layers
+from qsgm.blocks import parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_bytes_atomic
-from qsgm.grasp.angles import AngleEncoding
-from qsgm.grasp.decision import Decision
+from qsgm.network import Network
+from qsgm.task import TaskRecord, heads_from_json, heads_to_json, output_count
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.graspnet import GraspNet, Loss
-from qsgm.train.model.sgm import SGM_LAYERS, Sgm
+from qsgm.train.model.net import ConvNet
+from qsgm.train.model.sgm import Sgm
 
 FORMAT = "qsgm-checkpoint"
-VERSION = 2
+VERSION = 3
 LARGEST_BYTES = 64 * 2**20
 MOST_HIDDEN, WIDEST_HIDDEN = 4, 1024
 _MEND = "make one with `qsgm pretrain -o sgm.pt`"
@@ -49,27 +49,28 @@ class Checkpoint:
             each a block of its own (`6`, `5,6`, ...), and may be given for other blocks.
     """
 
-    net: GraspNet
-    sgms: Mapping[int, Sgm]  # by the layer they stand behind: the last ones but layer 6
+    task: TaskRecord
+    net: ConvNet
+    sgms: Mapping[int, Sgm]  # by the layer they stand behind: the last ones but the very last
     curvatures: Mapping[int, Curvature]  # by layer; a layer without one descends plainly
-    loss: Loss
     rates: dict[str, tuple[float, ...]]  # of SGD, by blocks such as `4,5,6`; first layer first
     card: dict[str, Any]  # how it was made, and its figures; plain JSON
-    short_gain: float = 1.0  # what short runs of three layers and more multiply rates with
-    decision: Decision | None = None  # whether a candidate is the object; older files have none
+    short_gain: float = 1.0  # what short runs of the meta-trained layers multiply rates with
 
     def __post_init__(self) -> None:
-        last = [*range(LAYERS - len(self.sgms), LAYERS)]
+        network = self.task.network
+        last = [*network.last(self.most_layers)[:-1]]
         if sorted(self.sgms) != last:
             raise ValueError(f"SGMs stand behind layers {sorted(self.sgms)}, not behind {last}")
         counts = {text: len(rates) for text, rates in self.rates.items()}
         for tuned in range(1, self.most_layers + 1):
-            if str(single_layers(tuned)) not in counts:
-                raise ValueError(f"there are no rates for layers {single_layers(tuned)}")
+            singles = single_layers(network.last(tuned))
+            if str(singles) not in counts:
+                raise ValueError(f"there are no rates for layers {singles}")
         if self.short_gain < 1:
             raise ValueError(f"short runs would have their rates lowered, times {self.short_gain}")
         for text, count in counts.items():
-            layers = len(parse_blocks(text).layers)
+            layers = len(parse_blocks(text, network.depth).layers)
             if count != layers or layers > self.most_layers:
                 raise ValueError(
                     f"{count} rates for layers {text}, of which {self.most_layers} can be tuned"
@@ -86,15 +87,16 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     data = {
         "format": FORMAT,
         "version": VERSION,
+        "task": json.dumps({"name": checkpoint.task.name, **checkpoint.task.settings}),
+        "network": json.dumps(checkpoint.task.network.to_json()),
+        "heads": json.dumps(heads_to_json(checkpoint.task.heads)),
         "net": checkpoint.net.state_dict(),
         "sgms": {layer: sgm.state_dict() for layer, sgm in checkpoint.sgms.items()},
         "hidden": {layer: list(sgm.hidden) for layer, sgm in checkpoint.sgms.items()},
         "curvatures": {k: list(one.matrices) for k, one in checkpoint.curvatures.items()},
-        "loss": asdict(checkpoint.loss),
         "rates": {blocks: list(rates) for blocks, rates in checkpoint.rates.items()},
         "card": json.dumps(checkpoint.card),
         "short_gain": checkpoint.short_gain,
-        "decision": None if checkpoint.decision is None else checkpoint.decision.to_json(),
     }
     buffer = BytesIO()
     torch.save(data, buffer)
@@ -111,16 +113,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
     if not _is_ours(data):
         raise QsgmError(f"{path} is no qsgm checkpoint of version {VERSION}; {_MEND}")
     try:
-        net = GraspNet()
+        task = _task(data)
+        net = ConvNet(task.network)
         net.load_state_dict(data["net"])
-        sgms = {layer: _sgm(layer, data) for layer in data["sgms"]}
-        curvatures = {layer: _curvature(layer, data) for layer in data["curvatures"]}
-        loss, rates = _loss(data["loss"]), _rates(data["rates"])
+        sgms = {layer: _sgm(layer, task.network, data) for layer in data["sgms"]}
+        curvatures = {layer: _curvature(layer, task.network, data) for layer in data["curvatures"]}
+        rates, gain = _rates(data["rates"]), _number(data["short_gain"])
         card = dict(json.loads(data["card"]))
-        gain = _number(data["short_gain"])
-        weighed = data.get("decision")
-        decision = None if weighed is None else Decision.from_json(weighed, str(path))
-        checkpoint = Checkpoint(net.eval(), sgms, curvatures, loss, rates, card, gain, decision)
+        checkpoint = Checkpoint(task, net.eval(), sgms, curvatures, rates, card, gain)
     except _UNFIT as error:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"
@@ -168,18 +168,32 @@ def _is_ours(data: Any) -> bool:
     return tuple(map(type, got)) == (str, int) and got == (FORMAT, VERSION)
 
 
-def _sgm(layer: Any, data: dict[str, Any]) -> Sgm:
-    if type(layer) is not int or layer not in SGM_LAYERS:
+def _task(data: dict[str, Any]) -> TaskRecord:
+    """What the network is for; every size is checked before anything of that size is made."""
+    settings = dict(json.loads(data["task"]))
+    network, heads = (json.loads(data[name]) for name in ("network", "heads"))
+    record = TaskRecord(
+        str(settings.pop("name")), Network.from_json(network), heads_from_json(heads), settings
+    )
+    if output_count(record.heads) != record.network.outputs:
+        raise ValueError("the heads are not the network's")
+    if sum(layer.weights for layer in record.network.layers) > LARGEST_BYTES:
+        raise ValueError("the network has more weights than a checkpoint could hold")
+    return record
+
+
+def _sgm(layer: Any, network: Network, data: dict[str, Any]) -> Sgm:
+    if type(layer) is not int or not 1 <= layer < network.depth:
         raise ValueError(f"there is no SGM behind layer {layer!r}")
-    sgm = Sgm(layer, _hidden(data["hidden"][layer]))
+    sgm = Sgm(network, layer, _hidden(data["hidden"][layer]))
     sgm.load_state_dict(data["sgms"][layer])
     return sgm.eval()
 
 
-def _curvature(layer: Any, data: dict[str, Any]) -> Curvature:
-    if type(layer) is not int or not 1 <= layer <= LAYERS:
+def _curvature(layer: Any, network: Network, data: dict[str, Any]) -> Curvature:
+    if type(layer) is not int or not 1 <= layer <= network.depth:
         raise ValueError(f"there is no layer {layer!r} to have a curvature")
-    plain = Curvature.identity(layer)
+    plain = Curvature.identity(network.layer(layer))
     curvature = Curvature(*data["curvatures"][layer])
     for matrix, expected in zip(curvature.matrices, plain.matrices, strict=True):
         if (matrix.shape, matrix.dtype) != (expected.shape, expected.dtype):
@@ -195,17 +209,6 @@ def _hidden(widths: Any) -> list[int]:
         if type(width) is not int or not 1 <= width <= WIDEST_HIDDEN:
             raise ValueError(f"a hidden width is not a whole number from 1 to {WIDEST_HIDDEN}")
     return list(widths)
-
-
-def _loss(fields: Any) -> Loss:
-    loss = Loss(**fields)
-    if loss.encoding not in get_args(AngleEncoding):
-        raise ValueError(f"the angle encoding is none of {get_args(AngleEncoding)}")
-    if not 0 <= _number(loss.label_smoothing) < 1:
-        raise ValueError("the label smoothing is not in [0, 1)")
-    if _number(loss.angle_weight) <= 0:
-        raise ValueError("the angle's weight is not positive")
-    return loss
 
 
 def _rates(by_blocks: Any) -> dict[str, tuple[float, ...]]:

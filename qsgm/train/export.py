@@ -1,41 +1,42 @@
-"""`qsgm fold-and-quantize`: from `sgm.pt` and a calibration set to the bundle that a device runs.
+"""`qsgm fold-and-quantize`: a checkpoint becomes a bundle.
 
-Fold, calibrate, quantize, build every graph, look whether ONNX Runtime makes integer operators of
-the int8 ones, and write the lot with a manifest and a model card. The same checkpoint and the
-same frames give the same bytes.
+Fold batchnorm, take ranges along fine-tuning runs on the calibration set, quantize, build every
+graph, and write them with the manifest that :mod:`qsgm.bundle` reads.
 """
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from onnx import ModelProto
 
-from qsgm.blocks import LAYERS, Blocks, one_block, parse_blocks, single_layers, tuned_layers
-from qsgm.bundle import (
-    FORMAT,
+from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
+from qsgm.bundle import Bundle
+from qsgm.errors import QsgmError
+from qsgm.files import check_replaceable, new_folder
+from qsgm.manifest import (
     MANIFEST,
     NETWORK,
     PRECISIONS,
-    VERSION,
     WEIGHTS,
-    Bundle,
+    FileEntry,
+    Manifest,
+    Method,
     OptimizerName,
+    Place,
     Precision,
+    Recipes,
+    SgmEntry,
     head_file,
     probe_file,
     step_file,
     trunk_file,
 )
-from qsgm.errors import QsgmError
-from qsgm.files import check_replaceable, new_folder
-from qsgm.grasp.crops import cut_crops, label_crops, plan_crops
-from qsgm.grasp.distractors import FILE as DISTRACTORS
+from qsgm.network import Network
+from qsgm.schedule import BATCH
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
@@ -43,7 +44,7 @@ from qsgm.train.export_report import ExportReport, LayerReport, Provenance, mode
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
-from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
+from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.graphs.trunk import (
     initializer_offsets,
@@ -51,148 +52,139 @@ from qsgm.train.graphs.trunk import (
     network_model,
     trunk_model,
 )
-from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
+from qsgm.train.heads import activate
 from qsgm.train.liveness import graph_memory
-from qsgm.train.model.curvature import FLAT
-from qsgm.train.model.fold import (
-    FoldedNet,
-    net_fold_error,
-    run_folded,
-    run_folded_sgm,
-    sgm_fold_error,
-)
-from qsgm.train.model.graspnet import normalize
+from qsgm.train.model.arrays import FLAT_ARRAYS, FoldedNet
+from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
+from qsgm.train.model.net import as_seen
 from qsgm.train.quantization.calibrate import AUTO, calibrate
 from qsgm.train.quantization.calibration_runs import EPOCHS, Trainee, prepare
-from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.train.quantization.lessons import Lessons, Watch
 from qsgm.train.quantization.sgm_fidelity import measure
 from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
 from qsgm.train.quantization.trunk_ranges import observe_trunk
-from qsgm.tune.loop import BATCH
 
 SEED = 0
-# Of the frozen layers, unless the user says otherwise: in int8 they take longer (README).
+# Of the frozen layers, unless the user says otherwise: in int8 they take longer (docs/cost.md).
 TRUNK: Precision = "float"
 OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
-# Exported beside each layer on its own, as far as the checkpoint can tune so many layers.
-GROUPED = ("4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6")
 # Folding moves rounding errors about, no more: larger than this, it went wrong.
 LARGEST_FOLD_ERROR = 1e-4  # relative to the largest output
-FOLD_CROPS = 64
+FOLD_SAMPLES = 64
 # SGD's rates for the SGMs are meta-trained; these are the usual ones, for every layer.
-BACKPROP_RATES = {"sgd": 1e-2, "adam": 1e-3}
+BACKPROP_RATES: dict[OptimizerName, float] = {"sgd": 1e-2, "adam": 1e-3}
 SGM_ADAM_RATE = 2e-3
 # As many as were meta-trained together, and for which the gain of short runs was found.
 MAML_LAYERS = 3
 
 
-def fold_and_quantize(
+@dataclass(frozen=True)
+class ExportOptions:
+    """What a bundle is to hold, and how it is calibrated."""
+
+    epochs: int = EPOCHS  # length of each fine-tuning run that ranges are taken along
+    blocks: tuple[Blocks, ...] = ()  # to be tuned beside each layer on its own and :func:`grouped`
+    calibrator: str = AUTO  # see :func:`qsgm.train.quantization.calibrate.calibrate`
+    activation_bits: ActivationBits = 16  # of the int8 SGMs' inputs, in one u8 plane or two
+
+
+def export_bundle(
     checkpoint_path: Path,
-    calib_folder: Path,
+    lessons: Lessons,
     output_folder: Path,
+    task_files: Mapping[str, bytes],
     watch: Watch,
-    epochs: int = EPOCHS,
-    blocks: Sequence[Blocks] = (),
-    calibrator: str = AUTO,
-    activation_bits: ActivationBits = 16,
+    options: ExportOptions = ExportOptions(),
 ) -> ExportReport:
     """Export a checkpoint as a bundle.
 
     Args:
         checkpoint_path: `sgm.pt`.
-        calib_folder: a calibration set, see :mod:`qsgm.train.grasp.draw_calibration`.
+        lessons: to calibrate on.
         output_folder: absent, empty, or an earlier bundle.
+        task_files: what the task adds to a bundle, by name.
         watch: told about progress.
-        epochs: length of each fine-tuning run that ranges are taken along.
-        blocks: to be tuned beside :data:`GROUPED` and each layer on its own.
-        calibrator: whose ranges the SGMs get, see
-            :func:`qsgm.train.quantization.calibrate.calibrate`.
-        activation_bits: of the int8 SGMs' inputs and hidden tensors, in one u8 plane or two.
+        options: what the bundle is to hold.
 
     Raises:
-        QsgmError: the checkpoint or the calibration set cannot be used, the output folder holds
-            something else, or the exported graphs would not do what they are for.
+        QsgmError: the checkpoint or the lessons cannot be used, the output folder holds something
+            else, or the exported graphs would not do what they are for.
     """
     check_replaceable(output_folder, WEIGHTS)
     trainee = prepare(load_checkpoint(checkpoint_path))
-    exported = exported_blocks(trainee.checkpoint.most_layers, blocks)
-    frames = CalibrationSet(calib_folder)
-    fold_error = check_folding(trainee, frames[0])
-    trainee, int8_trunk = calibrate_trunk(trainee, frames, watch)
-    calibration = calibrate(trainee, frames, SEED, watch, epochs, calibrator, activation_bits)
+    most, bits = trainee.checkpoint.most_layers, options.activation_bits
+    exported = exported_blocks(trainee.network, most, options.blocks)
+    fold_error = check_folding(trainee, lessons)
+    trainee, int8_trunk = calibrate_trunk(trainee, lessons, watch)
+    calibration = calibrate(trainee, lessons, SEED, watch, options.epochs, options.calibrator, bits)
     int8_sgms = {
-        k: quantize_sgm(sgm, calibration.ranges[k], activation_bits)
-        for k, sgm in trainee.sgms.items()
+        k: quantize_sgm(sgm, calibration.ranges[k], bits) for k, sgm in trainee.sgms.items()
     }
-    fidelity = measure(trainee, int8_sgms, frames, SEED, watch, epochs)
+    fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, options.epochs)
     graphs = build_graphs(trainee, int8_sgms, int8_trunk, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)
     files, sgms = bundle_files(graphs, int8_sgms, trainee.sgms)
-    files[DISTRACTORS] = distractor_file(SHEET_SEED)
+    files |= task_files
     layers = {
         k: LayerReport(fidelity[k], calibration.ranges[k], sgm, int8_sgms[k])
         for k, sgm in trainee.sgms.items()
     }
     size = sum(len(data) for data in files.values())
     report = ExportReport(str(output_folder), layers, calibration, fold_error, size)
-    description = describe(trainee, exported, files) | {"sgms": sgms}
-    files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, frames)).encode()
+    manifest = describe(trainee, exported, files, sgms)
+    files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, lessons)).encode()
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
-        add_peaks(Bundle(new, description), exported, watch)
-        text = json.dumps(description, indent=1, sort_keys=True) + "\n"
-        (new / MANIFEST).write_text(text, encoding="utf-8")
+        manifest = with_peaks(Bundle(new, manifest), exported, watch)
+        (new / MANIFEST).write_text(manifest.text(), encoding="utf-8")
     return report
 
 
-def add_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Watch) -> None:
-    """Say in the manifest how many bytes of activations each training step holds at once."""
+def with_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Watch) -> Manifest:
+    """The manifest, saying how many bytes of activations each training step holds at once."""
+    manifest, files = bundle.manifest, dict(bundle.manifest.files)
     steps = {
         step_file(precision, optimizer, one): one
-        for one in every_block(bundle.most_layers, blocks)
+        for one in every_block(bundle.network, manifest.most_layers, blocks)
         for precision in PRECISIONS
         for optimizer in optimizers_of(one)
     }
     for done, (name, one) in enumerate(steps.items(), start=1):
         peak = graph_memory(bundle, name, one, BATCH).peak
-        bundle.manifest["files"][name]["peak_activation_bytes"] = peak
+        files[name] = replace(files[name], peak_activation_bytes=peak)
         watch("memory", done, len(steps))
+    return replace(manifest, files=files)
 
 
-def every_block(most_layers: int, blocks: Sequence[Blocks]) -> list[Blocks]:
+def every_block(network: Network, most_layers: int, blocks: Sequence[Blocks]) -> list[Blocks]:
     """Those with SGMs, and all layers as one block for every number of them."""
-    return list(dict.fromkeys([*blocks, *map(one_block, range(1, most_layers + 1))]))
+    whole = (one_block(network.last(tuned)) for tuned in range(1, most_layers + 1))
+    return list(dict.fromkeys([*blocks, *whole]))
 
 
-def provenance(path: Path, trainee: Trainee, frames: CalibrationSet) -> Provenance:
+def provenance(path: Path, trainee: Trainee, lessons: Lessons) -> Provenance:
     """What a bundle is made from: a checkpoint's file and a calibration set."""
-    return Provenance(
-        path.name,
-        sha256(path.read_bytes()),
-        trainee.checkpoint.card,
-        len(frames),
-        sha256(frames.manifest_bytes),
-    )
+    checksum, card = sha256(path.read_bytes()), trainee.checkpoint.card
+    return Provenance(path.name, checksum, card, len(lessons), lessons.sha256)
 
 
 @torch.no_grad()
-def check_folding(trainee: Trainee, demonstration: Demonstration) -> float:
-    """Largest |difference| that folding makes to raw outputs and gradients, on a frame's crops.
+def check_folding(trainee: Trainee, lessons: Lessons) -> float:
+    """Largest |difference| that folding makes to raw outputs and gradients, on a lesson's samples.
 
     Raises QsgmError where it is more than rounding.
     """
-    height, width = demonstration.image.shape[:2]
-    rng = np.random.default_rng(SEED)
-    plan = plan_crops((height, width), demonstration.center_px, rng, FOLD_CROPS)
-    crops = torch.from_numpy(cut_crops(demonstration.image, plan))
+    lesson = lessons.lesson(0, np.random.default_rng(SEED), FOLD_SAMPLES)
+    samples = torch.from_numpy(lesson.cut(np.arange(FOLD_SAMPLES)))
     net, sgms = trainee.checkpoint.net, trainee.checkpoint.sgms
-    error = net_fold_error(net, trainee.net, crops)
-    refuse_large_error("the network", error, run_folded(trainee.net, crops))
-    errors, labels = [error], torch.from_numpy(label_crops(plan))
+    error, raw = net_fold_error(net, trainee.net, samples), run_folded(trainee.net, samples)
+    refuse_large_error("the network", error, raw)
+    answers = activate(trainee.checkpoint.task.heads, raw[:, :, 0, 0]).numpy()
+    errors, labels = [error], torch.from_numpy(lesson.labelled(answers).labels)
     for layer, sgm in trainee.sgms.items():
-        activation = net.between(normalize(crops), 1, layer)
+        activation = net.between(as_seen(net.network, samples), 1, layer)
         error = sgm_fold_error(sgms[layer], sgm, activation, labels)
         gradient = run_folded_sgm(sgm, activation, labels)
         refuse_large_error(f"the SGM behind layer {layer}", error, gradient)
@@ -211,7 +203,21 @@ def refuse_large_error(what: str, error: float, outputs: torch.Tensor) -> None:
         )
 
 
-def exported_blocks(most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
+def grouped(network: Network, most_layers: int) -> list[Blocks]:
+    """Blocks exported beside each layer on its own, as far as there are layers for them.
+
+    The last two layers as one; and earlier layers as one with the first of the last three.
+    """
+    depth = network.depth
+    first = depth - MAML_LAYERS + 1
+    blocks = [Blocks((range(first, first + 1), range(first + 1, depth + 1)))] if first > 0 else []
+    for start in range(first - 1, 0, -1):
+        singles = (range(k, k + 1) for k in range(first + 1, depth + 1))
+        blocks.append(Blocks((range(start, first + 1), *singles)))
+    return [one for one in blocks if len(one.layers) <= most_layers]
+
+
+def exported_blocks(network: Network, most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
     """What the bundle can tune with SGMs; raises QsgmError where that is not possible.
 
     First every number of layers, each layer on its own, then the groups.
@@ -222,16 +228,16 @@ def exported_blocks(most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
                 f"cannot export steps for the blocks {blocks}: the checkpoint has SGMs for "
                 f"{most_layers} layers at most, and one has to stand behind a block"
             )
-    grouped = [blocks for blocks in map(parse_blocks, GROUPED) if len(blocks.layers) <= most_layers]
-    singles = [single_layers(tuned) for tuned in range(1, most_layers + 1)]
-    return list(dict.fromkeys([*singles, *grouped, *more]))
+        parse_blocks(str(blocks), network.depth)
+    singles = [single_layers(network.last(tuned)) for tuned in range(1, most_layers + 1)]
+    return list(dict.fromkeys([*singles, *grouped(network, most_layers), *more]))
 
 
 def calibrate_trunk(
-    trainee: Trainee, frames: CalibrationSet, watch: Watch
+    trainee: Trainee, lessons: Lessons, watch: Watch
 ) -> tuple[Trainee, dict[int, QuantizedLayer]]:
     """The same with steps for u8 features, and its layers that can be frozen in int8."""
-    ranges = observe_trunk(trainee.net, frames, SEED, watch)
+    ranges = observe_trunk(trainee.net, lessons, SEED, watch)
     net = replace(trainee.net, feature_steps=feature_steps(ranges))
     return replace(trainee, net=net), quantize_trunk(net, ranges)
 
@@ -243,14 +249,14 @@ def build_graphs(
     blocks: Sequence[Blocks],
 ) -> dict[str, ModelProto]:
     """Every graph of a bundle, by file name."""
-    net, loss, most = trainee.net, trainee.checkpoint.loss, trainee.checkpoint.most_layers
-    graphs = {NETWORK: network_model(net, loss.encoding)}
+    net, heads, most = trainee.net, trainee.checkpoint.task.heads, trainee.checkpoint.most_layers
+    graphs = {NETWORK: network_model(net, heads)}
     for tuned in range(1, most + 1):
         graphs |= build_trunks(net, int8_trunk, tuned)
-        graphs[head_file(tuned)] = head_model(net, tuned, loss.encoding)
+        graphs[head_file(tuned)] = head_model(net, tuned, heads)
         if tuned > 1:
-            graphs[probe_file(tuned)] = probe_model(net, tuned, trainee.sgms, int8_sgms, loss)
-    for one in every_block(most, blocks):
+            graphs[probe_file(tuned)] = probe_model(net, tuned, trainee.sgms, int8_sgms, heads)
+    for one in every_block(net.network, most, blocks):
         graphs |= build_steps(trainee, int8_sgms, one)
     return graphs
 
@@ -259,10 +265,10 @@ def build_trunks(
     net: FoldedNet, int8_trunk: Mapping[int, QuantizedLayer], tuned: int
 ) -> dict[str, ModelProto]:
     """The frozen layers when the last `tuned` are tuned; if none are, there is one precision."""
-    last_frozen = LAYERS - tuned
-    trunks = {trunk_file("float", tuned): trunk_model(net, last_frozen)}
-    if last_frozen > 0:
-        trunks[trunk_file("int8", tuned)] = int8_trunk_model(net, int8_trunk, last_frozen)
+    layers, last_frozen = net.network.last(tuned), net.network.depth - tuned
+    trunks = {trunk_file("float", layers): trunk_model(net, last_frozen)}
+    if last_frozen > 0 and int8_trunk:
+        trunks[trunk_file("int8", layers)] = int8_trunk_model(net, int8_trunk, last_frozen)
     return trunks
 
 
@@ -270,13 +276,14 @@ def build_steps(
     trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], blocks: Blocks
 ) -> dict[str, ModelProto]:
     """The training steps of these blocks; a single one has no SGM in it, and one precision."""
-    net, loss = trainee.net, trainee.checkpoint.loss
+    net, heads = trainee.net, trainee.checkpoint.task.heads
     variants: dict[Precision, Mapping[int, AnySgm]] = {"int8": int8_sgms, "float": trainee.sgms}
     # Meta-trained with SGD and SGMs: neither Adam nor backpropagation uses it.
-    bent = {"sgd": trainee.checkpoint.curvatures if blocks.sgm_layers else FLAT, "adam": FLAT}
+    learnt = {k: one.arrays() for k, one in trainee.checkpoint.curvatures.items()}
+    curvatures = {"sgd": learnt if blocks.sgm_layers else FLAT_ARRAYS, "adam": FLAT_ARRAYS}
     return {
         step_file(precision, name, blocks): step_model(
-            net, blocks, variants[precision], loss, OPTIMIZERS[name], bent[name]
+            net, blocks, variants[precision], heads, OPTIMIZERS[name], curvatures[name]
         )
         for precision in (PRECISIONS if blocks.sgm_layers else ("float",))
         for name in optimizers_of(blocks)
@@ -285,16 +292,16 @@ def build_steps(
 
 def optimizers_of(blocks: Blocks) -> list[OptimizerName]:
     """What these blocks are trained with: Adam on each layer on its own, or on all as one."""
-    tuned = len(blocks.layers)
-    return [*OPTIMIZERS] if blocks in (single_layers(tuned), one_block(tuned)) else ["sgd"]
+    layers = blocks.layers
+    return [*OPTIMIZERS] if blocks in (single_layers(layers), one_block(layers)) else ["sgd"]
 
 
 def bundle_files(
     graphs: Mapping[str, ModelProto],
     int8_sgms: Mapping[int, QuantizedSgm],
     float_sgms: Mapping[int, FoldedSgm],
-) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Every file of a bundle but its manifest, and what that says of the SGMs.
+) -> tuple[dict[str, bytes], dict[int, SgmEntry]]:
+    """Every graph's file and that of the constants, and where the SGMs lie in it.
 
     Constants lie in one file beside the graphs, which are changed, or in the network's. That one is
     left whole: a tuned object is a copy of it. The device reads the float SGMs when it calibrates
@@ -303,14 +310,7 @@ def bundle_files(
     network = graphs[NETWORK].SerializeToString()
     shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
     sgms = {
-        str(layer): {
-            "bits": int8_sgms[layer].bits,
-            "convolutions": [
-                {"weight": shared.add_array(conv.weight), "bias": shared.add_array(conv.bias)}
-                for conv in sgm.convs
-            ],
-        }
-        for layer, sgm in float_sgms.items()
+        layer: shared_sgm(shared, sgm, int8_sgms[layer].bits) for layer, sgm in float_sgms.items()
     }
     shared.take_from(model for name, model in graphs.items() if name != NETWORK)
     files = {name: model.SerializeToString() for name, model in graphs.items()}
@@ -318,66 +318,61 @@ def bundle_files(
 
 
 def describe(
-    trainee: Trainee, blocks: Sequence[Blocks], files: Mapping[str, bytes]
-) -> dict[str, Any]:
-    """The manifest that :mod:`qsgm.bundle` reads."""
-    loss = trainee.checkpoint.loss
-    decision = trainee.checkpoint.decision
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "encoding": loss.encoding,
-        "label_smoothing": loss.label_smoothing,
-        "most_layers": trainee.checkpoint.most_layers,
-        "trunk": TRUNK,
-        "blocks": [str(one) for one in blocks],
-        "files": {
-            name: {"sha256": sha256(data), "bytes": len(data)} for name, data in files.items()
-        },
-        "initializers": places(trainee, files[NETWORK]),
-        "recipes": recipes(trainee.checkpoint, blocks),
-        **({} if decision is None else {"decision": decision.to_json()}),
-    }
+    trainee: Trainee,
+    blocks: Sequence[Blocks],
+    files: Mapping[str, bytes],
+    sgms: Mapping[int, SgmEntry],
+) -> Manifest:
+    """The manifest of a bundle with these files."""
+    checkpoint = trainee.checkpoint
+    return Manifest(
+        checkpoint.task,
+        checkpoint.most_layers,
+        TRUNK,
+        tuple(str(one) for one in blocks),
+        recipes(checkpoint, blocks),
+        places(trainee, files[NETWORK]),
+        sgms,
+        {name: FileEntry(sha256(data)) for name, data in files.items()},
+    )
 
 
-def places(trainee: Trainee, network: bytes) -> dict[str, dict[str, Any]]:
+def places(trainee: Trainee, network: bytes) -> dict[str, Place]:
     """Where the weights and biases that can be tuned lie in the network's file."""
     offsets = initializer_offsets(network)
     found = {}
-    for number in tuned_layers(trainee.checkpoint.most_layers):
+    for number in trainee.network.last(trainee.checkpoint.most_layers):
         layer = trainee.net.layers[number - 1]
         for name, array in ((f"weight{number}", layer.weight), (f"bias{number}", layer.bias)):
-            found[name] = {"offset": offsets[name][0], "shape": list(array.shape)}
+            found[name] = Place(offsets[name][0], array.shape)
     return found
 
 
-def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[str, Any]:
+def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Recipes]:
     """Default optimizer and rates of both methods, by blocks."""
-    sgm = {
-        "sgd": {str(one): list(sgm_rates(checkpoint, one)) for one in blocks},
+    sgm: dict[OptimizerName, dict[str, tuple[float, ...]]] = {
+        "sgd": {str(one): sgm_rates(checkpoint, one) for one in blocks},
         "adam": {
-            str(one): [SGM_ADAM_RATE] * len(one.layers)
+            str(one): (SGM_ADAM_RATE,) * len(one.layers)
             for one in blocks
             if "adam" in optimizers_of(one)
         },
     }
-    whole = [one_block(tuned) for tuned in range(1, checkpoint.most_layers + 1)]
+    network = checkpoint.task.network
+    whole = [one_block(network.last(tuned)) for tuned in range(1, checkpoint.most_layers + 1)]
     bp = {
-        name: {str(one): [rate] * len(one.layers) for one in whole}
+        name: {str(one): (rate,) * len(one.layers) for one in whole}
         for name, rate in BACKPROP_RATES.items()
     }
     gains = {
         str(one): checkpoint.short_gain if len(one.layers) >= MAML_LAYERS else 1.0 for one in blocks
     }
-    return {
-        "sgm": {"optimizer": "sgd", "rates": sgm, "short_gains": gains},
-        "bp": {"optimizer": "adam", "rates": bp},
-    }
+    return {"sgm": Recipes("sgd", sgm, gains), "bp": Recipes("adam", bp)}
 
 
 def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:
     """The checkpoint's for these blocks, else those for as many layers on their own."""
-    single = checkpoint.rates[str(single_layers(len(blocks.layers)))]
+    single = checkpoint.rates[str(single_layers(blocks.layers))]
     return checkpoint.rates.get(str(blocks), single)
 
 

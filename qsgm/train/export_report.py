@@ -12,9 +12,10 @@ from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
 from qsgm.sgm.float import FoldedSgm
-from qsgm.sgm.int8 import LABELS, QuantizedSgm, SgmRanges, constants
+from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, constants
+from qsgm.tables import plain_table
 from qsgm.train.quantization.calibrate import EQUAL_COSINE, Calibration
-from qsgm.tune.report import fidelity_json, plain_table
+from qsgm.tune.report import fidelity_json
 
 # (line break: in a terminal only)
 _HEADERS = (
@@ -55,13 +56,14 @@ class LayerReport:
     @property
     def activation_range(self) -> tuple[float, float]:
         """Lowest and highest activation of any channel."""
-        low, high = (ends[:-LABELS] for ends in (self.ranges.input_low, self.ranges.input_high))
+        labels = self.sgm.labels
+        low, high = (ends[:-labels] for ends in (self.ranges.input_low, self.ranges.input_high))
         return float(low.min()), float(high.max())
 
     @property
     def activation_scale(self) -> tuple[float, float]:
         """What one u8 step stands for in the finest and in the coarsest activation channel."""
-        step = 1 / self.int8_sgm.input_gain[:-LABELS]
+        step = 1 / self.int8_sgm.input_gain[: -self.sgm.labels]
         return float(step.min()), float(step.max())
 
     def to_json(self) -> dict[str, Any]:
@@ -98,7 +100,7 @@ class LayerReport:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What :func:`qsgm.train.export.fold_and_quantize` did."""
+    """What :func:`qsgm.train.export.export_bundle` did."""
 
     output: str
     layers: dict[int, LayerReport]

@@ -26,13 +26,14 @@ import onnx
 import onnxruntime as ort
 from onnx import helper
 
-from qsgm.bench.memory import StepMemory
-from qsgm.bench.step_jobs import start_of, still_loop
 from qsgm.blocks import Blocks
-from qsgm.bundle import Bundle, Precision, step_file
+from qsgm.bundle import Bundle
+from qsgm.manifest import Precision, step_file
 from qsgm.runtime import session_options
 from qsgm.train.graphs.inspection import all_nodes, bodies
-from qsgm.tune.prepare import running_graphs
+from qsgm.tune.features import running_graphs
+from qsgm.tune.loop import StepLoop
+from qsgm.tune.prepare import in_step_layout
 
 # Their result is their first input under another shape.
 VIEWS = frozenset({"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"})
@@ -40,6 +41,17 @@ VIEWS = frozenset({"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"})
 IN_PLACE = frozenset({"Relu", "Sigmoid", "Tanh", "Clip", "Cast"})
 KERNEL = "_kernel_time"
 IN_USE, CHANGE = "mem_bytes_requested_in_use", "mem_requested_in_use_delta"
+
+
+@dataclass(frozen=True)
+class StepMemory:
+    """Of one training step, in bytes."""
+
+    peak: int  # most activations alive at once
+    node: str  # that runs then
+    alive: Mapping[str, int]  # by tensor, largest first
+    first_step: int | None  # most that the runtime asked for at once; None: it does not say
+    later_steps: int | None  # the same once it has planned one block for all
 
 
 @dataclass(frozen=True)
@@ -99,7 +111,9 @@ def graph_memory(
     def two_steps(session: ort.InferenceSession) -> None:
         # In the first one memory is asked for piece by piece, from then on in one block.
         with running_graphs(bundle):
-            step = still_loop(session, start_of(bundle, len(blocks.layers)), blocks, batch)
+            step = still_loop(
+                session, in_step_layout(bundle.start_weights(blocks.layers)), blocks, batch
+            )
             step()
             step()
 
@@ -257,3 +271,24 @@ def shares(run: Run, source: Tensor, moment: int, size: int) -> bool:
     """Whether a node's result of this size lies in the memory of its first input."""
     over = run.op_type in IN_PLACE and source.last == moment and source.bytes == size
     return over or run.op_type in VIEWS
+
+
+def still_loop(
+    session: Any, start: Mapping[str, Any], blocks: Blocks, batch: int
+) -> Callable[[], float]:
+    """A step on so many samples that changes no weight."""
+    inputs = {value.name: value for value in session.get_inputs()}
+    labels = np.zeros((batch, inputs["labels"].shape[1]), np.float32)
+    rates = dict.fromkeys(blocks.layers, 0.0)
+    loop = StepLoop(session, random_features(session, batch), labels, start, rates)
+    rows = np.arange(batch)
+    return lambda: loop.step(rows)
+
+
+def random_features(session: Any, samples: int) -> Any:
+    """What a graph's input `features` takes, of so many samples: pixels or codes, or floats."""
+    (features,) = (value for value in session.get_inputs() if value.name == "features")
+    shape, rng = (samples, *features.shape[1:]), np.random.default_rng(0)
+    if "uint8" in features.type:
+        return rng.integers(0, 256, shape, np.uint8)
+    return rng.uniform(0, 1, shape).astype(np.float32)

@@ -9,28 +9,31 @@ speed, memory, resources and growth compares steps that only a whole bundle has.
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import onnx
 
-from qsgm.blocks import Blocks, one_block, single_layers
-from qsgm.bundle import (
+from qsgm.blocks import Blocks, one_block
+from qsgm.bundle import Bundle
+from qsgm.errors import QsgmError
+from qsgm.files import check_replaceable, new_folder
+from qsgm.manifest import (
     MANIFEST,
     NETWORK,
     PRECISIONS,
     WEIGHTS,
-    Bundle,
+    FileEntry,
+    Manifest,
+    Method,
+    Recipes,
     head_file,
     probe_file,
     step_file,
     trunk_file,
 )
-from qsgm.errors import QsgmError
-from qsgm.files import check_replaceable, new_folder
-from qsgm.grasp.distractors import FILE as DISTRACTORS
-from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere
+from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
 from qsgm.train.graphs.short_names import shorten
 
 
@@ -75,25 +78,27 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
     check_replaceable(output, WEIGHTS)
     if output.resolve() == bundle.folder.resolve():
         raise QsgmError(f"{output} is the bundle itself; pass another folder to -o")
-    if str(blocks) not in bundle.blocks:
+    if str(blocks) not in bundle.manifest.blocks:
         raise QsgmError(
             f"the bundle {bundle.folder} has no SGMs for the blocks {blocks}; choose one of "
-            f"{' or '.join(bundle.blocks)}"
+            f"{' or '.join(bundle.manifest.blocks)}"
         )
-    network = (bundle.folder / NETWORK).read_bytes()
+    network = bundle.read(NETWORK)
     graphs = {name: onnx.load(bundle.graph_path(name)) for name in kept_graphs(bundle, blocks)}
     shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
-    sgms = kept_sgms(bundle, blocks, shared)
+    sgms = {
+        layer: shared_sgm(shared, bundle.float_sgm(layer), bundle.activation_bits(layer))
+        for layer in blocks.layers[:-1]
+    }
     shared.take_from(graphs.values())
     for graph in graphs.values():
         shorten(graph)
     files = {name: graph.SerializeToString() for name, graph in graphs.items()}
-    files |= {NETWORK: network, WEIGHTS: shared.data, **kept_things(bundle)}
-    manifest = kept_manifest(bundle, blocks) | {
-        "sgms": sgms,
-        "files": {name: kept_entry(bundle, name, data) for name, data in files.items()},
-    }
-    files[MANIFEST] = json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()
+    files |= {NETWORK: network, WEIGHTS: shared.data, **task_files(bundle)}
+    entries = {name: kept_entry(bundle, name, data) for name, data in files.items()}
+    manifest = replace(kept_manifest(bundle.manifest, blocks), sgms=sgms, files=entries)
+    text = json.dumps(manifest.to_json(), sort_keys=True, separators=(",", ":"))
+    files[MANIFEST] = text.encode()
     with new_folder(output, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
@@ -103,58 +108,44 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
 
 def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
     """Names of the graphs that tuning these blocks opens; a bundle may do without the probe."""
-    tuned, recipes = len(blocks.layers), bundle.manifest["recipes"]
-    sgm, bp = (recipes[method]["optimizer"] for method in ("sgm", "bp"))
-    steps = [step_file(precision, sgm, blocks) for precision in PRECISIONS]
-    names = [head_file(tuned), trunk_file(bundle.trunk, tuned), *steps]
-    names.append(step_file("float", bp, one_block(tuned)))
-    if probe_file(tuned) in bundle.manifest["files"]:
-        names.append(probe_file(tuned))
+    layers, recipes = blocks.layers, bundle.manifest.recipes
+    steps = [step_file(one, recipes["sgm"].optimizer, blocks) for one in PRECISIONS]
+    names = [head_file(len(layers)), trunk_file(bundle.manifest.trunk, layers), *steps]
+    names.append(step_file("float", recipes["bp"].optimizer, one_block(layers)))
+    if bundle.has(probe_file(len(layers))):
+        names.append(probe_file(len(layers)))
     return list(dict.fromkeys(names))
 
 
-def kept_things(bundle: Bundle) -> dict[str, bytes]:
-    """The sheet of things to tell an object apart from, if the bundle has one."""
-    there = DISTRACTORS in bundle.manifest["files"]
-    return {DISTRACTORS: (bundle.folder / DISTRACTORS).read_bytes()} if there else {}
+def task_files(bundle: Bundle) -> dict[str, bytes]:
+    """What the task added to the bundle: neither graphs nor constants nor the model card."""
+    names = (name for name in bundle.manifest.files if not name.endswith((".onnx", ".bin", ".md")))
+    return {name: bundle.read(name) for name in names}
 
 
-def kept_sgms(bundle: Bundle, blocks: Blocks, shared: SharedConstants) -> dict[str, Any]:
-    """What the manifest says of the SGMs; their numbers go to the shared constants."""
-    return {
-        str(layer): {
-            "bits": bundle.activation_bits(layer),
-            "convolutions": [
-                {"weight": shared.add_array(conv.weight), "bias": shared.add_array(conv.bias)}
-                for conv in bundle.float_sgm(layer).convs
-            ],
-        }
-        for layer in single_layers(len(blocks.layers)).sgm_layers
-    }
-
-
-def kept_entry(bundle: Bundle, name: str, data: bytes) -> dict[str, Any]:
+def kept_entry(bundle: Bundle, name: str, data: bytes) -> FileEntry:
     """What the manifest says of a file: what it holds, and of a step the memory it takes."""
-    peak = bundle.peak_activation_bytes(name)
-    memory = {} if peak is None else {"peak_activation_bytes": peak}
-    return {"sha256": hashlib.sha256(data).hexdigest(), **memory}
+    return FileEntry(hashlib.sha256(data).hexdigest(), bundle.peak_activation_bytes(name))
 
 
-def kept_recipe(recipe: Mapping[str, Any], text: str) -> dict[str, Any]:
+def kept_recipes(recipes: Recipes, text: str) -> Recipes:
     """Its own optimizer's rates of these blocks."""
-    name = recipe["optimizer"]
-    return {"optimizer": name, "rates": {name: {text: recipe["rates"][name][text]}}}
+    name = recipes.optimizer
+    gains = {text: recipes.short_gains[text]} if text in recipes.short_gains else {}
+    return Recipes(name, {name: {text: recipes.rates[name][text]}}, gains)
 
 
-def kept_manifest(bundle: Bundle, blocks: Blocks) -> dict[str, Any]:
+def kept_manifest(manifest: Manifest, blocks: Blocks) -> Manifest:
     """The bundle's own, of these blocks only."""
-    sgm, bp = (bundle.manifest["recipes"][method] for method in ("sgm", "bp"))
-    text, whole = str(blocks), str(one_block(len(blocks.layers)))
-    gains = {"short_gains": {text: sgm["short_gains"][text]}}
     names = [f"{kind}{k}" for k in blocks.layers for kind in ("weight", "bias")]
-    return bundle.manifest | {
-        "most_layers": len(blocks.layers),
-        "blocks": [text],
-        "recipes": {"sgm": kept_recipe(sgm, text) | gains, "bp": kept_recipe(bp, whole)},
-        "initializers": {name: bundle.manifest["initializers"][name] for name in names},
+    kept: dict[Method, Recipes] = {
+        "sgm": kept_recipes(manifest.recipes["sgm"], str(blocks)),
+        "bp": kept_recipes(manifest.recipes["bp"], str(one_block(blocks.layers))),
     }
+    return replace(
+        manifest,
+        most_layers=len(blocks.layers),
+        blocks=(str(blocks),),
+        recipes=kept,
+        initializers={name: manifest.initializers[name] for name in names},
+    )

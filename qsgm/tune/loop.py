@@ -5,20 +5,18 @@ the next one reads, nothing is copied or allocated, and no buffer is read and wr
 step, which ONNX Runtime does not promise to be safe.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from math import log
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from qsgm.schedule import batches, rate_factor, steps_per_epoch
+from qsgm.tune.features import Features
+
 Array = NDArray[np.float32]
-# What the frozen layers leave; where nothing is frozen, the pixels.
-Features = NDArray[np.float32] | NDArray[np.uint8]
 NEXT = "_next"
-BATCH = 32
-SHORT_RUN_STEPS, LONG_RUN_STEPS = 75, 500  # 3 and 20 epochs on the device
 
 
 class StepLoop:
@@ -28,7 +26,7 @@ class StepLoop:
         self,
         session: ort.InferenceSession,
         features: Features,  # (N, P, C), input of the first tuned layer
-        labels: Array,  # (N, 3)
+        labels: Array,  # (N, L)
         weights: Mapping[str, Array],  # weight{k}: (Co, K), bias{k}: (Co,)
         rates: Mapping[int, float],  # per tuned layer
     ) -> None:
@@ -59,7 +57,7 @@ class StepLoop:
         factor: float = 1.0,
         options: ort.RunOptions | None = None,
     ) -> float:
-        """Train on the crops `rows`, all rates times `factor`.
+        """Train on the samples `rows`, all rates times `factor`.
 
         Returns the batch's mean loss before the update.
         """
@@ -72,7 +70,7 @@ class StepLoop:
         return float(self._loss)
 
     def put(self, features: Features, labels: Array) -> None:
-        """Other crops in the place of those the loop has: `rows` are then among these.
+        """Other samples in the place of those the loop has: `rows` are then among these.
 
         Nothing happens where they are the same arrays.
         """
@@ -111,43 +109,26 @@ def _buffers(arrays: Mapping[str, Array]) -> dict[str, ort.OrtValue]:
     }
 
 
-def short_run_factor(gain: float, steps: int) -> float:
-    """What the rates of a run of this length are multiplied with.
-
-    `gain` for up to 75 steps, nothing from 500 on, and a power of the length between: a short run
-    has to take large steps, and is over before these could lead it astray.
-    """
-    shortness = log(LONG_RUN_STEPS / max(1, steps)) / log(LONG_RUN_STEPS / SHORT_RUN_STEPS)
-    return float(gain ** min(1.0, max(0.0, shortness)))
-
-
-def rate_factor(step: int, steps: int) -> float:
-    """Linear decay of all rates, from 1 at step 0 to nothing at step `steps`.
-
-    A constant rate leaves the weights wandering about their optimum; this lets them settle.
-    """
-    return 1.0 - step / steps
-
-
-def batches(count: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
-    """Rows of every batch of one epoch over `count` crops, shuffled; the last may be smaller."""
-    order = rng.permutation(count)
-    for start in range(0, count, BATCH):
-        yield order[start : start + BATCH]
-
-
-def tune(
-    loop: StepLoop,
+def run_epochs(
+    step: Callable[[NDArray[np.int64], float], float],
     count: int,
     epochs: int,
     rng: np.random.Generator,
     after_epoch: Callable[[int, float], None],
 ) -> None:
-    """Run `epochs` passes over the first `count` crops; `after_epoch` gets its number and loss."""
-    step, steps = 0, epochs * -(-count // BATCH)
+    """Run `epochs` passes over the first `count` samples, all rates decaying linearly.
+
+    Args:
+        step: takes the rows of a batch and a factor on all rates, returns the loss.
+        count: of samples to learn from.
+        epochs: passes over them.
+        rng: orders the samples.
+        after_epoch: gets an epoch's number and mean loss.
+    """
+    done, steps = 0, epochs * steps_per_epoch(count)
     for epoch in range(1, epochs + 1):
         losses = []
         for rows in batches(count, rng):
-            losses.append(loop.step(rows, rate_factor(step, steps)))
-            step += 1
+            losses.append(step(rows, rate_factor(done, steps)))
+            done += 1
         after_epoch(epoch, float(np.mean(losses)))

@@ -16,18 +16,15 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from onnx import TensorProto
 
-from qsgm.blocks import tuned_layers
+from qsgm.network import NONE, ONE, Layer, Network, Pair, area
 from qsgm.train.graphs.build import Graph, Ops, Product, Value
 from qsgm.train.graphs.optimizers import Gradient, value_of
-from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedLayer, FoldedNet
-from qsgm.weights import to_step_layout
+from qsgm.train.model.arrays import PIXEL_OFFSET, PIXEL_SCALE, CurvatureArrays, FoldedNet
 
-CROP_SIDE = 128
-# Windows of one crop, above which a block with an SGM goes crop by crop. Layers 1 and 2 are quicker
-# so; layer 3, with 169, adds a fifth to a step of four layers, which then takes a quarter of the
-# memory. Layer 4 has 25, and a crop's product reads all weights anew: a step of three layers would
-# take twice as long.
+# Windows of one sample, above which a block with an SGM goes sample by sample. GraspNet's layers 1
+# and 2 are quicker so; layer 3, with 169, adds a fifth to a step of four layers, which then takes a
+# quarter of the memory. Layer 4 has 25, and a sample's product reads all weights anew: a step of
+# three layers would take twice as long.
 MANY_WINDOWS = 100
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
@@ -37,43 +34,38 @@ FloatArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class TunedLayer:
-    """A layer that is trained: its geometry, and its weights as inputs of the graph."""
+    """A layer that is trained: its place in the network, and its weights as inputs of the graph."""
 
+    network: Network
     number: int
-    folded: FoldedLayer
-    side: int  # its input map is side x side
     weight: Value  # (Co, kh * kw * Ci)
     bias: Value  # (Co,)
     features: DTypeLike | None  # what it reads, if it is the first tuned layer
     steps: FloatArray | None  # (kh * kw * Ci,), where its windows are codes: what one stands for
 
     @property
-    def kernel(self) -> int:
-        return int(self.folded.weight.shape[2])
+    def layer(self) -> Layer:
+        return self.network.layer(self.number)
 
     @property
-    def width(self) -> int:
-        """Length of one window: kh * kw * Ci."""
-        return int(self.folded.weight[0].size)
+    def side(self) -> Pair:
+        """Of its input map."""
+        return self.network.before(self.number)
 
     @property
-    def channels(self) -> int:
-        return len(self.folded.bias)
-
-    @property
-    def before_side(self) -> int:
-        """Of the map that its convolution makes of a crop."""
-        return output_side(self.side, self.kernel, self.folded.stride)
+    def after_side(self) -> Pair:
+        """Of the map behind its pool."""
+        return self.network.after(self.number)
 
     @property
     def positions(self) -> int:
         """Windows in its input map."""
-        return self.before_side**2
+        return self.network.windows(self.number)
 
     @property
-    def after_side(self) -> int:
-        """Of the map behind its pool, which of a crop covers the whole map."""
-        return 1 if self.folded.pool > 1 else self.before_side
+    def positions_after(self) -> int:
+        """Positions in the map behind its pool."""
+        return self.network.positions_after(self.number)
 
     @property
     def many_windows(self) -> bool:
@@ -81,9 +73,10 @@ class TunedLayer:
         return self.positions > MANY_WINDOWS
 
     @property
-    def into(self) -> int:
-        """Channels of its input."""
-        return int(self.folded.weight.shape[1])
+    def is_product(self) -> bool:
+        """Whether its windows are its input's positions as they are."""
+        layer = self.layer
+        return (layer.kernel, layer.stride, layer.padding) == (ONE, ONE, NONE)
 
 
 @dataclass(frozen=True)
@@ -112,46 +105,34 @@ class Gradients:
     bias: Gradient  # (1, Co)
 
 
-def output_side(side: int, kernel: int, stride: int) -> int:
-    """Side of the map that a convolution without padding makes of a square one."""
-    return (side - kernel) // stride + 1
-
-
-def input_side(net: FoldedNet, number: int) -> int:
-    """Side of the map that layer `number` sees of a crop."""
-    side = CROP_SIDE
-    for layer in net.layers[: number - 1]:
-        side = output_side(side, layer.weight.shape[2], layer.stride) - layer.pool + 1
-    return side
-
-
 def declare_layers(graph: Graph, net: FoldedNet, tuned: int) -> list[TunedLayer]:
     """The last `tuned` layers, their weights and biases declared as inputs."""
-    layers, first = [], tuned_layers(tuned)[0]
-    for number in tuned_layers(tuned):
-        folded = net.layers[number - 1]
-        shape = to_step_layout(folded.weight).shape
-        weight = graph.input(f"weight{number}", np.float32, shape)
-        bias = graph.input(f"bias{number}", np.float32, shape[:1])
-        side, features, steps = input_side(net, number), None, None
-        if number == first:
+    layers, numbers = [], net.network.last(tuned)
+    for number in numbers:
+        layer = net.network.layer(number)
+        weight = graph.input(f"weight{number}", np.float32, (layer.out, layer.window))
+        bias = graph.input(f"bias{number}", np.float32, (layer.out,))
+        features, steps = None, None
+        if number == numbers[0]:
             features = features_dtype(net, number - 1)
             if number - 1 in net.feature_steps:
-                steps = np.tile(net.feature_steps[number - 1], folded.weight[0, 0].size)
-        layers.append(TunedLayer(number, folded, side, weight, bias, features, steps))
+                steps = np.tile(net.feature_steps[number - 1], area(layer.kernel))
+        layers.append(TunedLayer(net.network, number, weight, bias, features, steps))
     return layers
 
 
 def declare_features(graph: Graph, net: FoldedNet, tuned: int) -> Value:
-    """Input of the first tuned layer, for all crops: (N, P, C), see :func:`features_dtype`."""
-    number = tuned_layers(tuned)[0]
-    shape = ("crops", input_side(net, number) ** 2, net.layers[number - 1].weight.shape[1])
-    return graph.input("features", features_dtype(net, number - 1), shape)
+    """Input of the first tuned layer, for all samples: (N, P, C), see :func:`features_dtype`."""
+    number = net.network.last(tuned)[0]
+    maps = net.network.positions_before(number), net.network.layer(number).into
+    return graph.input("features", features_dtype(net, number - 1), ("samples", *maps))
 
 
 def features_dtype(net: FoldedNet, last_frozen: int) -> DTypeLike:
     """uint8 for pixels, and for the output of a layer that has steps; else float32."""
-    return np.uint8 if last_frozen == 0 or last_frozen in net.feature_steps else np.float32
+    if last_frozen == 0:
+        return np.uint8 if net.network.input_kind == "pixels" else np.float32
+    return np.uint8 if last_frozen in net.feature_steps else np.float32
 
 
 def as_seen(op: Ops, layer: TunedLayer, x: Value) -> Value:
@@ -165,7 +146,7 @@ def as_seen(op: Ops, layer: TunedLayer, x: Value) -> Value:
     if layer.features == np.uint8:
         x = op.Cast(x, to=TensorProto.FLOAT)
         x = normalized(op, x) if layer.number == 1 else x
-    return op.Reshape(x, op.shape(-1, layer.into)) if layer.kernel == 1 else x
+    return op.Reshape(x, op.shape(-1, layer.layer.into)) if layer.is_product else x
 
 
 def normalized(op: Ops, pixels: Value) -> Value:
@@ -174,32 +155,42 @@ def normalized(op: Ops, pixels: Value) -> Value:
 
 
 def declare_batch(graph: Graph, net: FoldedNet, tuned: int) -> Batch:
-    """All crops' features and labels as inputs, and `rows`, which picks a batch."""
+    """All samples' features and labels as inputs, and `rows`, which picks a batch."""
     features = declare_features(graph, net, tuned)
-    labels = graph.input("labels", np.float32, ("crops", 3))
+    labels = graph.input("labels", np.float32, ("samples", net.network.outputs))
     rows = graph.input("rows", np.int64, ("batch",))
     op = graph.within("batch")
     size = op.Cast(op.Size(rows), to=TensorProto.FLOAT)
     return Batch(op.Gather(features, rows, axis=0), op.Gather(labels, rows, axis=0), size)
 
 
-def gather_windows(op: Ops, x: Value, side: int, kernel: int, stride: int) -> Value:
-    """All windows of square maps (B, side * side, C): (B, rows, columns, kernel * kernel, C)."""
+def gather_windows(op: Ops, x: Value, side: Pair, kernel: Pair, stride: Pair) -> Value:
+    """All windows of maps (B, H * W, C) of this size: (B, rows, columns, kh * kw, C)."""
     # Stored as a sum of three small tensors, which the runtime folds when it loads.
-    start, step = np.arange(0, side - kernel + 1, stride), np.arange(kernel)
-    row = op.constant(side * start[:, None, None], np.int64)
-    column = op.constant(start[:, None], np.int64)
-    offset = op.constant((side * step[:, None] + step).ravel(), np.int64)
+    (height, width), (tall, wide) = side, kernel
+    down = np.arange(0, height - tall + 1, stride[0])
+    right = np.arange(0, width - wide + 1, stride[1])
+    row = op.constant(width * down[:, None, None], np.int64)
+    column = op.constant(right[:, None], np.int64)
+    taps = (width * np.arange(tall)[:, None] + np.arange(wide)).ravel()
+    offset = op.constant(taps, np.int64)
     return op.Gather(x, op.Add(op.Add(row, column), offset), axis=1)
 
 
 def cut_windows(op: Ops, layer: TunedLayer, x: Value) -> Value:
     """The windows (B * P, K) that a layer sees of its input (B * P_in, Ci) or (B, P_in, Ci)."""
-    if layer.kernel == 1:
+    if layer.is_product:
         return x
-    maps = op.Reshape(x, op.shape(-1, layer.side**2, layer.into))
-    windows = gather_windows(op, maps, layer.side, layer.kernel, layer.folded.stride)
-    return op.Reshape(windows, op.shape(-1, layer.width))
+    one, (height, width) = layer.layer, layer.side
+    up, left = one.padding
+    maps = op.Reshape(x, op.shape(-1, height * width, one.into))
+    if one.padding != NONE:
+        maps = op.Reshape(maps, op.shape(-1, height, width, one.into))
+        maps = op.Pad(maps, op.shape(0, up, left, 0, 0, up, left, 0))
+        height, width = height + 2 * up, width + 2 * left
+        maps = op.Reshape(maps, op.shape(-1, height * width, one.into))
+    windows = gather_windows(op, maps, (height, width), one.kernel, one.stride)
+    return op.Reshape(windows, op.shape(-1, one.window))
 
 
 def forward(op: Ops, layer: TunedLayer, x: Value) -> Pass:
@@ -208,25 +199,45 @@ def forward(op: Ops, layer: TunedLayer, x: Value) -> Pass:
     if layer.steps is not None:
         weight = op.Mul(weight, op.constant(layer.steps))
     active = op.Gemm(seen, weight, layer.bias, transB=1)
-    if layer.folded.relu:
+    if layer.layer.relu:
         active = op.Relu(active)
-    if layer.folded.pool == 1:
+    if layer.layer.pool == ONE:
         return Pass(seen, active, active)
-    # Of a crop, the pool covers the whole map.
-    return Pass(seen, active, op.ReduceMean(as_maps(op, layer, active), axes=[1], keepdims=0))
+    maps = as_maps(op, layer, active)
+    if layer.network.pools_all(layer.number):
+        return Pass(seen, active, op.ReduceMean(maps, axes=[1], keepdims=0))
+    pooled = op.MatMul(op.constant(pool_shares(layer)), maps)
+    return Pass(seen, active, op.Reshape(pooled, op.shape(-1, layer.layer.out)))
+
+
+def pool_shares(layer: TunedLayer) -> FloatArray:
+    """What each position in front of a pool has in each one behind it, (P', P)."""
+    (height, width), (tall, wide) = layer.network.convolved(layer.number), layer.layer.pool
+    shares = np.zeros((*layer.after_side, height, width), np.float32)
+    for row, column in np.ndindex(*layer.after_side):
+        down, right = (
+            at * step for at, step in zip((row, column), layer.layer.pool_stride, strict=True)
+        )
+        shares[row, column, down : down + tall, right : right + wide] = 1 / (tall * wide)
+    return shares.reshape(layer.positions_after, height * width)
 
 
 def as_maps(op: Ops, layer: TunedLayer, x: Value) -> Value:
-    """Rows (B * P, Co) of a layer's output in front of its pool, crop by crop: (B, P, Co)."""
-    return op.Reshape(x, op.shape(-1, layer.positions, layer.channels))
+    """Rows (B * P, Co) of a layer's output in front of its pool, sample by sample: (B, P, Co)."""
+    return op.Reshape(x, op.shape(-1, layer.positions, layer.layer.out))
 
 
 def through_activation(op: Ops, layer: TunedLayer, done: Pass, gradient: Value) -> Value:
     """A gradient on the layer's activation (B * P', C) carried back through it: (B * P, C)."""
-    if layer.folded.pool > 1:
+    channels = layer.layer.out
+    if layer.network.pools_all(layer.number):
         share = op.Mul(gradient, op.constant(1 / layer.positions))
-        gradient = at_every_position(op, share, layer.positions, layer.channels)
-    if layer.folded.relu:
+        gradient = at_every_position(op, share, layer.positions, channels)
+    elif layer.layer.pool != ONE:
+        maps = op.Reshape(gradient, op.shape(-1, layer.positions_after, channels))
+        spread = op.MatMul(op.constant(pool_shares(layer).T), maps)
+        gradient = op.Reshape(spread, op.shape(-1, channels))
+    if layer.layer.relu:
         gradient = op.Mul(gradient, is_positive(op, done.active))
     return gradient
 
@@ -246,7 +257,7 @@ def is_positive(op: Ops, x: Value) -> Value:
 
 
 def summed_gradients(op: Ops, done: Pass, dz: Value) -> Gradients:
-    """What the windows, as they are, and all rows of dz (B * P, C) come to."""
+    """Gradients summed over the batch: dz^T @ windows, column sums of dz (B * P, C)."""
     bias = op.ReduceSum(dz, op.shape(0), keepdims=1)
     return Gradients(Product(dz, done.windows, turned=True), bias)
 
@@ -259,37 +270,45 @@ def weight_gradients(op: Ops, layer: TunedLayer, summed: Gradients) -> Gradients
     return Gradients(weight, summed.bias)
 
 
-def bent_gradients(
-    op: Ops, layer: TunedLayer, summed: Gradients, curvature: Curvature
+def preconditioned_gradients(
+    op: Ops, layer: TunedLayer, summed: Gradients, curvature: CurvatureArrays
 ) -> Gradients:
-    """:func:`weight_gradients` along the layer's curvature, as `Curvature.bend` has them."""
-    window, into, out, bias = (matrix.numpy() for matrix in curvature.matrices)
+    """:func:`weight_gradients` along the curvature, as `Curvature.precondition` has them."""
+    window, into = curvature.window, curvature.into
     if layer.steps is not None:  # where they cost no node
         into = layer.steps[: len(into), None] * into
-    d_weight = value_of(op, summed.weight)
-    if layer.kernel == 1:  # one position: its factor goes with another matrix
+    d_weight, channels = value_of(op, summed.weight), layer.layer.out
+    if layer.layer.kernel == ONE:  # one position: its factor goes with another matrix
         windows = op.MatMul(d_weight, op.constant(window[0, 0] * into))
     else:
-        maps = op.Reshape(d_weight, op.shape(layer.channels, len(window), len(into)))
+        maps = op.Reshape(d_weight, op.shape(channels, len(window), len(into)))
         windows = op.MatMul(op.constant(window.T), op.MatMul(maps, op.constant(into)))
-        windows = op.Reshape(windows, op.shape(layer.channels, layer.width))
+        windows = op.Reshape(windows, op.shape(channels, layer.layer.window))
     d_bias = value_of(op, summed.bias)
-    return Gradients(Product(op.constant(out.T), windows), Product(d_bias, op.constant(bias)))
+    out = op.constant(curvature.out.T)
+    return Gradients(Product(out, windows), Product(d_bias, op.constant(curvature.bias)))
 
 
 def gradient_before(op: Ops, layer: TunedLayer, dz: Value) -> Value:
     """dz (B * P, C) carried back to the layer's input: (B * P_in, Ci)."""
-    into, kernel, side = layer.into, layer.kernel, layer.side
-    if kernel == 1:
+    if layer.is_product:
         return op.Gemm(dz, layer.weight)
-    weight = op.Reshape(layer.weight, op.shape(-1, kernel, kernel, into))
-    maps = op.Reshape(dz, op.shape(-1, layer.before_side, layer.before_side, layer.channels))
-    unseen = (side - kernel) % layer.folded.stride  # rows that no window reaches
+    one, (height, width) = layer.layer, layer.network.convolved(layer.number)
+    weight = op.Reshape(layer.weight, op.shape(-1, *one.kernel, one.into))
+    maps = op.Reshape(dz, op.shape(-1, height, width, one.out))
+    unseen = [  # rows and columns that no window reaches
+        (side + 2 * pad - kernel) % stride
+        for side, pad, kernel, stride in zip(
+            layer.side, one.padding, one.kernel, one.stride, strict=True
+        )
+    ]
+    padding = {} if one.padding == NONE else {"pads": [*one.padding, *one.padding]}
     before = op.ConvTranspose(
         op.Transpose(maps, perm=(0, 3, 1, 2)),
         op.Transpose(weight, perm=(0, 3, 1, 2)),
-        kernel_shape=(kernel, kernel),
-        strides=(layer.folded.stride, layer.folded.stride),
-        output_padding=(unseen, unseen),
+        kernel_shape=one.kernel,
+        strides=one.stride,
+        output_padding=unseen,
+        **padding,
     )
-    return op.Reshape(op.Transpose(before, perm=(0, 2, 3, 1)), op.shape(-1, into))
+    return op.Reshape(op.Transpose(before, perm=(0, 2, 3, 1)), op.shape(-1, one.into))

@@ -1,53 +1,44 @@
-"""The loss in a graph: output activation, value, and the error that starts every gradient."""
+"""All heads' losses in a graph: output activation, value, the error that gradients start with."""
 
-from qsgm.grasp.angles import AngleEncoding
+from collections.abc import Sequence
+
+from qsgm.task import Head, channels_of
 from qsgm.train.graphs.build import Ops, Value
-from qsgm.train.model.graspnet import Loss
+from qsgm.train.heads import LOSSES
 
 
-def channels(op: Ops, x: Value, start: int, stop: int) -> Value:
-    """Channels `start` to `stop` of (B, C, ...)."""
-    return op.Slice(x, op.shape(start), op.shape(stop), op.shape(1))
+def channels(op: Ops, x: Value, some: range) -> Value:
+    """These channels of (B, C, ...)."""
+    return op.Slice(x, op.shape(some.start), op.shape(some.stop), op.shape(1))
 
 
-def activate(op: Ops, raw: Value, encoding: AngleEncoding) -> tuple[Value, Value]:
-    """Raw outputs (B, 3, ...) to quality in (0, 1), (B, 1, ...), and sine, cosine (B, 2, ...)."""
-    return op.Sigmoid(channels(op, raw, 0, 1)), turned(op, channels(op, raw, 1, 3), encoding)
+def activate(op: Ops, heads: Sequence[Head], raw: Value) -> Value:
+    """Raw outputs (B, O, ...) as the user sees them."""
+    parts = [
+        LOSSES[head.kind].graph_activate(op, head, channels(op, raw, place))
+        for head, place in zip(heads, channels_of(heads), strict=True)
+    ]
+    return op.Concat(*parts, axis=1) if len(parts) > 1 else parts[0]
 
 
-def turned(op: Ops, raw: Value, encoding: AngleEncoding) -> Value:
-    """Raw outputs (B, 2, ...) of the angle to its sine and cosine."""
-    if encoding == "double":
-        return op.Tanh(raw)
-    return op.Concat(op.Tanh(channels(op, raw, 0, 1)), op.Sigmoid(channels(op, raw, 1, 2)), axis=1)
-
-
-def angle_slope(op: Ops, angle: Value, encoding: AngleEncoding) -> Value:
-    """Derivative (B, 2) of the activated sine and cosine by their raw outputs."""
-    one = op.constant(1.0)
-    if encoding == "double":
-        return op.Sub(one, op.Mul(angle, angle))
-    sine, cosine = channels(op, angle, 0, 1), channels(op, angle, 1, 2)
-    slopes = op.Sub(one, op.Mul(sine, sine)), op.Mul(cosine, op.Sub(one, cosine))
-    return op.Concat(*slopes, axis=1)
-
-
-def loss_and_error(op: Ops, loss: Loss, raw: Value, labels: Value) -> tuple[Value, Value]:
-    """Mean loss, a scalar, and each sample's d loss / d raw outputs (B, 3); both inputs (B, 3)."""
+def loss_and_error(
+    op: Ops, heads: Sequence[Head], raw: Value, labels: Value
+) -> tuple[Value, Value]:
+    """Mean loss, a scalar, and each sample's d loss / d raw outputs (B, O); both inputs (B, O)."""
+    means, errors = [], []
+    places = channels_of(heads)
     # Each slice is taken once: the runtime then makes one node of those of a tensor.
-    logit, raw_angle = channels(op, raw, 0, 1), channels(op, raw, 1, 3)
-    label, direction = channels(op, labels, 0, 1), channels(op, labels, 1, 3)
-    smoothing = loss.label_smoothing
-    target = op.Add(op.Mul(label, op.constant(1 - smoothing)), op.constant(smoothing / 2))
-    angle = turned(op, raw_angle, loss.encoding)
-    miss = op.Sub(angle, direction)
-    # The derivative of the angle's loss by the angle; negatives have none.
-    pull = op.Mul(op.Mul(label, op.constant(2 * loss.angle_weight)), miss)
-
-    log_loss = op.Sub(op.Softplus(logit), op.Mul(target, logit))
-    # Half of pull * miss, summed over sine and cosine, is their mean.
-    means = (op.ReduceMean(x, keepdims=0) for x in (log_loss, op.Mul(pull, miss)))
-
-    logit_error = op.Sub(op.Sigmoid(logit), target)
-    angle_error = op.Mul(pull, angle_slope(op, angle, loss.encoding))
-    return op.Add(*means), op.Concat(logit_error, angle_error, axis=1)
+    known = {place: channels(op, labels, place) for place in places}
+    for head, place in zip(heads, places, strict=True):
+        gate = None
+        if head.where is not None:
+            one = range(head.where, head.where + 1)
+            gate = known[one] if one in known else channels(op, labels, one)
+        loss = LOSSES[head.kind]
+        mean, error = loss.graph(op, head, channels(op, raw, place), known[place], gate)
+        means.append(mean)
+        errors.append(error)
+    total = means[0]
+    for mean in means[1:]:
+        total = op.Add(total, mean)
+    return total, op.Concat(*errors, axis=1) if len(errors) > 1 else errors[0]

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from onnx import TensorProto
 
+from qsgm.schedule import MOMENTUM
 from qsgm.train.graphs.build import Graph, Ops, Product, Value
 
 Gradient = Product | Value
@@ -35,7 +36,7 @@ class Optimizer(Protocol):
 class Sgd:
     """SGD with momentum, without dampening, as torch has it."""
 
-    momentum: float = 0.9
+    momentum: float = MOMENTUM
 
     @property
     def moments(self) -> tuple[str, ...]:

@@ -7,9 +7,9 @@ from onnx import ModelProto
 
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
-from qsgm.grasp.angles import AngleEncoding
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm
+from qsgm.task import Heads
 from qsgm.train.graphs.build import Graph, Ops, Value
 from qsgm.train.graphs.layers import (
     Batch,
@@ -34,8 +34,7 @@ from qsgm.train.graphs.sgm import (
     underflow_fraction,
 )
 from qsgm.train.graphs.step import forward_all, sgms_behind
-from qsgm.train.model.fold import FoldedNet
-from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.arrays import FoldedNet
 
 
 def probe_model(
@@ -43,7 +42,7 @@ def probe_model(
     tuned: int,
     float_sgms: Mapping[int, FoldedSgm],
     int8_sgms: Mapping[int, QuantizedSgm],
-    loss: Loss,
+    heads: Heads,
 ) -> ModelProto:
     """Gradients on every tuned layer's activation but the last one's, each sample's own.
 
@@ -60,13 +59,13 @@ def probe_model(
         raise QsgmError(
             f"cannot probe the SGMs of {tuned} tuned layers: the last layer has none; choose more"
         )
-    blocks = single_layers(tuned)
+    blocks = single_layers(net.network.last(tuned))
     sgms_behind(blocks, float_sgms), sgms_behind(blocks, int8_sgms)
     graph = Graph("probe")
     layers = declare_layers(graph, net, tuned)
     batch = declare_batch(graph, net, tuned)
     passes = forward_all(graph, layers, batch.features)
-    truth = probe_truth(graph, layers, passes, batch, loss)
+    truth = probe_truth(graph, layers, passes, batch, heads)
     for layer, done in zip(layers[:-1], passes[:-1], strict=True):
         number = layer.number
         given = probe_sgm(graph, layer, done, batch, float_sgms[number], int8_sgms[number])
@@ -74,24 +73,24 @@ def probe_model(
     return graph.model()
 
 
-def head_model(net: FoldedNet, tuned: int, encoding: AngleEncoding) -> ModelProto:
-    """`features` (N, P, C) and the tuned layers to `outputs` (N, 3): quality, sine, cosine."""
+def head_model(net: FoldedNet, tuned: int, heads: Heads) -> ModelProto:
+    """`features` (N, P, C) and the tuned layers to `outputs` (N, O), activated."""
     graph = Graph("head")
     layers = declare_layers(graph, net, tuned)
     passes = forward_all(graph, layers, declare_features(graph, net, tuned))
     op = graph.within("head")
-    activated = activate(op, passes[-1].after, encoding)
-    graph.output("outputs", op.Concat(*activated, axis=1), np.float32, ("crops", 3))
+    outputs = activate(op, heads, passes[-1].after)
+    graph.output("outputs", outputs, np.float32, ("samples", net.network.outputs))
     return graph.model()
 
 
 def probe_truth(
-    graph: Graph, layers: list[TunedLayer], passes: list[Pass], batch: Batch, loss: Loss
+    graph: Graph, layers: list[TunedLayer], passes: list[Pass], batch: Batch, heads: Heads
 ) -> dict[int, Value]:
     """Declare `true{k}` of every layer but the last; returns them by layer."""
     truth = {}
     op = graph.within("truth")
-    _, gradient = loss_and_error(op, loss, passes[-1].after, batch.labels)
+    _, gradient = loss_and_error(op, heads, passes[-1].after, batch.labels)
     for layer, done, before in list(zip(layers[1:], passes[1:], layers, strict=False))[::-1]:
         op = graph.within(f"layer{layer.number}/back")
         gradient = gradient_before(op, layer, through_activation(op, layer, done, gradient))
@@ -109,14 +108,14 @@ def probe_sgm(
     int8_one: QuantizedSgm,
 ) -> dict[str, Value]:
     """Declare `activation{k}`, `float{k}`, `int8{k}`, `clipped{k}` of a layer; both gradients."""
-    number, side = layer.number, layer.after_side
+    number = layer.number
     op = graph.within(f"layer{number}/float")
-    seen = sgm_inputs(op, done.after, side, batch.labels)
+    seen = sgm_inputs(op, done.after, layer.after_side, batch.labels, layer.network.outputs)
     report_maps(op, f"activation{number}", done.after, layer)
-    floating = float_sgm(op, float_one, side, seen)
+    floating = float_sgm(op, float_one, seen)
     report_maps(op, f"float{number}", floating, layer)
     op = graph.within(f"layer{number}/int8")
-    int8 = int8_sgm(op, int8_one, side, seen)
+    int8 = int8_sgm(op, int8_one, seen)
     report_maps(op, f"int8{number}", int8, layer)
     clipped = clipped_fraction(op, int8_one, scaled_inputs(op, int8_one, seen))
     graph.output(f"clipped{number}", clipped, np.float32, ())
@@ -127,9 +126,9 @@ def probe_sgm(
 
 def report_maps(op: Ops, name: str, rows: Value, layer: TunedLayer) -> None:
     """Declare rows (B * P, C) behind a layer as an output, crop by crop: (B, P, C)."""
-    positions = layer.after_side**2
-    maps = op.Reshape(rows, op.shape(-1, positions, layer.channels))
-    op.graph.output(name, maps, np.float32, ("batch", positions, layer.channels))
+    positions = layer.positions_after
+    maps = op.Reshape(rows, op.shape(-1, positions, layer.layer.out))
+    op.graph.output(name, maps, np.float32, ("batch", positions, layer.layer.out))
 
 
 def probe_updates(
@@ -142,5 +141,5 @@ def probe_updates(
         found = weight_gradients(op, layer, summed_gradients(op, done, dz))
         d_weight, d_bias = value_of(op, found.weight), value_of(op, found.bias)
         update = op.Concat(d_weight, op.Transpose(d_bias, perm=(1, 0)), axis=1)
-        shape = layer.channels, layer.width + 1
+        shape = layer.layer.out, layer.layer.window + 1
         graph.output(f"update_{name}{layer.number}", update, np.float32, shape)

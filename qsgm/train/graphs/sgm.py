@@ -1,16 +1,16 @@
 """A static SGM in a graph, in float and in int8.
 
-Both take what the SGM sees, a row per crop and position, (B * P, Ci), and answer with gradients
-(B * P, C). Behind layers 4 and 5 a crop has one position, so a 1x1 convolution is a matrix product.
-Behind layers 1 to 3 they differ: in float the weights are constants, so that a Conv is quickest;
+Both take what the SGM sees, a row per sample and position, (B * P, Ci), and answer with gradients
+(B * P, C). Where a sample has one position a 1x1 convolution is a matrix product. Where it has maps
+they differ: in float the weights are constants, so that a Conv is quickest;
 ONNX Runtime has no integer Conv with a float result, so int8 cuts windows for a matrix product.
 """
 
 import numpy as np
 
+from qsgm.network import ONE, Pair, area
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import (
-    LABELS,
     PLANE_STEPS,
     U8_ZERO,
     UNDERFLOW_STEPS,
@@ -27,71 +27,75 @@ FINE, COARSE = range(2)
 
 
 def sgm_gradient(
-    op: Ops, sgm: FoldedSgm | QuantizedSgm, side: int, after: Value, labels: Value
+    op: Ops, sgm: FoldedSgm | QuantizedSgm, after: Value, labels: Value, count: int
 ) -> Value:
-    """The gradient (B * P, C) for an activation of as many, P = side * side, and labels (B, 3)."""
-    seen = sgm_inputs(op, after, side, labels)
-    if isinstance(sgm, QuantizedSgm):
-        return int8_sgm(op, sgm, side, seen)
-    return float_sgm(op, sgm, side, seen)
+    """The gradient (B * P, C) for an activation of as many, and labels (B, L), L = `count`."""
+    seen = sgm_inputs(op, after, sgm.side, labels, count)
+    return int8_sgm(op, sgm, seen) if isinstance(sgm, QuantizedSgm) else float_sgm(op, sgm, seen)
 
 
-def sgm_inputs(op: Ops, after: Value, side: int, labels: Value) -> Value:
+def sgm_inputs(op: Ops, after: Value, side: Pair, labels: Value, count: int) -> Value:
     """Activation (B * P, C) and label, the same at every position: side by side, (B * P, Ci)."""
-    if side > 1:
-        labels = at_every_position(op, labels, side**2, LABELS)
+    if area(side) > 1:
+        labels = at_every_position(op, labels, area(side), count)
     return op.Concat(after, labels, axis=1)
 
 
-def float_sgm(op: Ops, sgm: FoldedSgm, side: int, seen: Value) -> Value:
+def float_sgm(op: Ops, sgm: FoldedSgm, seen: Value) -> Value:
     """Inputs (B * P, Ci) through all convolutions, with ReLU between: (B * P, C)."""
     inputs, channels = sgm.convs[0].weight.shape[1], len(sgm.convs[-1].bias)
     x = seen
-    if sgm.kernel == 1:
+    if sgm.kernel == ONE:
         for i, conv in enumerate(sgm.convs):
             weight, bias = op.constant(conv.weight[:, :, 0, 0]), op.constant(conv.bias)
             x = op.Gemm(op.Relu(x) if i else x, weight, bias, transB=1)
         return x
-    x = op.Transpose(op.Reshape(seen, op.shape(-1, side, side, inputs)), perm=(0, 3, 1, 2))
+    x = op.Transpose(op.Reshape(seen, op.shape(-1, *sgm.side, inputs)), perm=(0, 3, 1, 2))
+    pads = [side // 2 for side in sgm.kernel] * 2
     for i, conv in enumerate(sgm.convs):
         weight, bias = op.constant(conv.weight), op.constant(conv.bias)
-        x = op.Conv(op.Relu(x) if i else x, weight, bias, pads=[sgm.kernel // 2] * 4)
+        x = op.Conv(op.Relu(x) if i else x, weight, bias, pads=pads)
     return op.Reshape(op.Transpose(x, perm=(0, 2, 3, 1)), op.shape(-1, channels))
 
 
-def int8_sgm(op: Ops, sgm: QuantizedSgm, side: int, seen: Value) -> Value:
+def int8_sgm(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
     """Integer products (QGemm); the last one's sum leaves as float, so it needs no scale.
 
     ReLU costs no node: rounding to u8 clips at zero. Padding is real zeros in front of the first
     product, where they have a code of their own, and the code 0 in front of the others.
     """
     declare_constants(op, sgm)
-    x = scaled_inputs(op, sgm, padded(op, seen, side, sgm.kernel, len(sgm.input_low)))
+    x = scaled_inputs(op, sgm, padded(op, seen, sgm.side, sgm.kernel, len(sgm.input_low)))
     planes = as_planes(op, sgm, x)
     for i, product in enumerate(sgm.products):
         if i > 0:
-            planes = framed_planes(op, sgm, side, x, len(sgm.products[i - 1].bias))
+            planes = framed_planes(op, sgm, x, len(sgm.products[i - 1].bias))
         width = product.coarse.shape[1]
         widths = width, width * sgm.bits // 8
         high, both = (
-            u8_windows(op, u8, side, sgm.kernel, width)
-            for u8, width in zip(planes, widths, strict=True)
+            u8_windows(op, u8, sgm, width) for u8, width in zip(planes, widths, strict=True)
         )
         x = int8_product(op, f"sgm{sgm.layer}/{i}", product, sgm, high, both)
     return x
 
 
-def padded(op: Ops, x: Value, side: int, kernel: int, channels: int) -> Value:
-    """Positions (B * P, C) of square maps with zeros around them, (B, P', C); for 1x1 as they are.
+def padded(op: Ops, x: Value, side: Pair, kernel: Pair, channels: int) -> Value:
+    """Positions (B * P, C) of maps with zeros around them, (B, P', C); for 1x1 as they are.
 
     Numbers of either type: of float32 a real zero, of u8 the code 0.
     """
-    if kernel == 1:
+    if kernel == ONE:
         return x
-    pad = kernel // 2
-    maps = op.Reshape(x, op.shape(-1, side, side, channels))
-    framed = op.Pad(maps, op.shape(0, pad, pad, 0, 0, pad, pad, 0))
-    return op.Reshape(framed, op.shape(-1, (side + 2 * pad) ** 2, channels))
+    up, left = (length // 2 for length in kernel)
+    maps = op.Reshape(x, op.shape(-1, *side, channels))
+    framed = op.Pad(maps, op.shape(0, up, left, 0, 0, up, left, 0))
+    return op.Reshape(framed, op.shape(-1, area(framed_side(side, kernel)), channels))
+
+
+def framed_side(side: Pair, kernel: Pair) -> Pair:
+    """Of maps with as many zeros around them as a window reaches out."""
+    height, width = (length + 2 * (reach // 2) for length, reach in zip(side, kernel, strict=True))
+    return height, width
 
 
 def declare_constants(op: Ops, sgm: QuantizedSgm) -> None:
@@ -117,21 +121,19 @@ def as_planes(op: Ops, sgm: QuantizedSgm, x: Value) -> tuple[Value, Value]:
     return high, op.Concat(high, low, axis=-1)
 
 
-def framed_planes(
-    op: Ops, sgm: QuantizedSgm, side: int, hidden: Value, channels: int
-) -> tuple[Value, Value]:
+def framed_planes(op: Ops, sgm: QuantizedSgm, hidden: Value, channels: int) -> tuple[Value, Value]:
     """The planes of hidden maps (B * P, C), with the code 0 around them where they are maps."""
     high, both = as_planes(op, sgm, hidden)
     return (
-        padded(op, high, side, sgm.kernel, channels),
-        padded(op, both, side, sgm.kernel, channels * sgm.bits // 8),
+        padded(op, high, sgm.side, sgm.kernel, channels),
+        padded(op, both, sgm.side, sgm.kernel, channels * sgm.bits // 8),
     )
 
 
-def u8_windows(op: Ops, x: Value, side: int, kernel: int, width: int) -> Value:
+def u8_windows(op: Ops, x: Value, sgm: QuantizedSgm, width: int) -> Value:
     """Windows (B * P, width) of :func:`padded` u8 maps, as what the runtime turns into integers."""
-    if kernel > 1:
-        windows = gather_windows(op, x, side + 2 * (kernel // 2), kernel, stride=1)
+    if sgm.kernel != ONE:
+        windows = gather_windows(op, x, framed_side(sgm.side, sgm.kernel), sgm.kernel, ONE)
         x = op.Reshape(windows, op.shape(-1, width))
     return op.DequantizeLinear(x, op.constant(1.0), op.constant(0, np.uint8))
 
@@ -146,11 +148,11 @@ def int8_product(
     """
     # What the runtime folds has to be where it finds constants: outside of any loop.
     outside, weight, scale = op.outside(), f"{name}/weight", f"{name}/scale"
-    coarse = weight_plane(outside, weight, product, sgm.kernel**2, COARSE)
+    coarse = weight_plane(outside, weight, product, area(sgm.kernel), COARSE)
     coarse_scale = outside.Mul(scale, op.constant(float(PLANE_STEPS)))
     first = op.Gemm(high, s8_weight(op, coarse, coarse_scale, product), transB=1)
     if sgm.bits == 8:
-        weight = weight_plane(outside, weight, product, sgm.kernel**2, FINE)
+        weight = weight_plane(outside, weight, product, area(sgm.kernel), FINE)
     bias = op.DequantizeLinear(f"{name}/bias", scale, axis=0)
     rest = op.Gemm(both, s8_weight(op, weight, scale, product), bias, transB=1)
     return op.Add(first, rest)

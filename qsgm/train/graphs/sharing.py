@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from onnx import ModelProto
 from onnx.external_data_helper import set_external_data
 
+from qsgm.manifest import Place, SgmEntry
+from qsgm.sgm.float import FoldedSgm
+from qsgm.sgm.int8 import ActivationBits
 from qsgm.train.graphs.trunk import initializer_offsets
 
 # Smaller constants stay in the graph: naming the place of another takes as many bytes.
@@ -66,10 +69,10 @@ class SharedConstants:
             self._data.extend(raw)
         return self._offsets[raw]
 
-    def add_array(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Offset and shape of a float32 array in the file."""
+    def add_array(self, array: NDArray[Any]) -> Place:
+        """Where a float32 array lies in the file."""
         raw = np.ascontiguousarray(array, dtype="<f4").tobytes()
-        return {"offset": self.add(raw), "shape": list(array.shape)}
+        return Place(self.add(raw), array.shape)
 
     def take_from(self, models: Iterable[ModelProto]) -> None:
         """Move the larger constants of these models to the file; the models are changed."""
@@ -86,3 +89,9 @@ class SharedConstants:
         if self._other is None or offset is None:
             return self.location, self.add(raw)
         return self._other.location, offset
+
+
+def shared_sgm(shared: SharedConstants, sgm: FoldedSgm, bits: ActivationBits) -> SgmEntry:
+    """What a manifest says of an SGM whose float numbers go to the shared constants."""
+    places = ((shared.add_array(conv.weight), shared.add_array(conv.bias)) for conv in sgm.convs)
+    return SgmEntry(bits, tuple(places))

@@ -1,6 +1,6 @@
 """A whole training step as one graph, block by block; one block is backpropagation.
 
-Inputs: `features` (N, P, C) and `labels` (N, 3) of all crops; `rows` (B,), the batch; one scalar
+Inputs: `features` (N, P, C) and `labels` (N, L) of all samples; `rows` (B,), the batch; one scalar
 `rate{k}` per layer; and the state, in which `weight{k}` (Co, kh * kw * Ci) and `bias{k}` are the
 layer's and everything else starts at zero. All are float32, but for `rows`, int64, and features,
 which are u8 codes or pixels. Which inputs are state shows in the outputs' names.
@@ -14,19 +14,21 @@ from onnx import ModelProto
 
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
+from qsgm.network import area
 from qsgm.sgm.float import FoldedSgm
-from qsgm.sgm.int8 import LABELS, QuantizedSgm
+from qsgm.sgm.int8 import QuantizedSgm
+from qsgm.task import Heads
 from qsgm.train.graphs.build import Graph, Value
 from qsgm.train.graphs.layers import (
     Batch,
     Gradients,
     Pass,
     TunedLayer,
-    bent_gradients,
     declare_batch,
     declare_layers,
     forward,
     gradient_before,
+    preconditioned_gradients,
     summed_gradients,
     through_activation,
     weight_gradients,
@@ -34,9 +36,7 @@ from qsgm.train.graphs.layers import (
 from qsgm.train.graphs.loss import loss_and_error
 from qsgm.train.graphs.optimizers import Gradient, Optimizer, Rule, plus
 from qsgm.train.graphs.sgm import sgm_gradient
-from qsgm.train.model.curvature import FLAT, Curvature
-from qsgm.train.model.fold import FoldedNet
-from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.arrays import FLAT_ARRAYS, CurvatureArrays, FoldedNet
 
 AnySgm = FoldedSgm | QuantizedSgm
 
@@ -45,9 +45,9 @@ def step_model(
     net: FoldedNet,
     blocks: Blocks,
     sgms: Mapping[int, AnySgm],
-    loss: Loss,
+    heads: Heads,
     optimizer: Optimizer,
-    curvatures: Mapping[int, Curvature] = FLAT,
+    curvatures: Mapping[int, CurvatureArrays] = FLAT_ARRAYS,
 ) -> ModelProto:
     """A feed-forward step: every block updates itself before the next one runs.
 
@@ -55,7 +55,7 @@ def step_model(
         net: gives the geometry; its weights are inputs of the graph.
         blocks: which of the last layers are trained, and how far true gradients are carried back.
         sgms: by layer, float or int8; one behind every block but the last.
-        loss: gives the last block its gradient.
+        heads: give the last block its gradient.
         optimizer: updates each parameter.
         curvatures: by layer, where gradients are bent before the optimizer sees them.
 
@@ -71,7 +71,7 @@ def step_model(
     for group in blocks.groups:
         block = [layers[number] for number in group]
         if group[-1] not in used:
-            gradients, x = last_block(graph, block, loss, x, batch)
+            gradients, x = last_block(graph, block, heads, x, batch)
         elif any(layer.many_windows for layer in block):
             gradients, x = block_by_crops(graph, block, used[group[-1]], x, batch)
         else:
@@ -101,12 +101,12 @@ def forward_all(graph: Graph, layers: list[TunedLayer], x: Value) -> list[Pass]:
 
 
 def last_block(
-    graph: Graph, block: list[TunedLayer], loss: Loss, x: Value, batch: Batch
+    graph: Graph, block: list[TunedLayer], heads: Heads, x: Value, batch: Batch
 ) -> tuple[list[Gradients], Value]:
-    """Gradients from the loss, which is declared as an output; and the raw outputs (B, 3)."""
+    """Gradients from the loss, which is declared as an output; and the raw outputs (B, O)."""
     op = graph.within(f"layer{block[-1].number}")
     passes = forward_all(graph, block, x)
-    mean, error = loss_and_error(op, loss, passes[-1].after, batch.labels)
+    mean, error = loss_and_error(op, heads, passes[-1].after, batch.labels)
     graph.output("loss", mean, np.float32, ())
     return carried_back(graph, block, passes, op.Div(error, batch.size)), passes[-1].after
 
@@ -117,7 +117,7 @@ def whole_block(
     """Gradients from the SGM behind a block; and what the block gives, (B * P', C)."""
     op, last = graph.within(f"layer{block[-1].number}"), block[-1]
     passes = forward_all(graph, block, x)
-    gradient = sgm_gradient(op, sgm, last.after_side, passes[-1].after, batch.labels)
+    gradient = sgm_gradient(op, sgm, passes[-1].after, batch.labels, last.network.outputs)
     # Divided by the batch here, where the gradient is smallest: the rest is sums.
     return carried_back(graph, block, passes, op.Div(gradient, batch.size)), passes[-1].after
 
@@ -134,9 +134,9 @@ def block_by_crops(
     first, last = block[0], block[-1]
     body = Graph("crop", graph)
     sums = [declare_sums(body, layer) for layer in block]
-    maps = first.side**2, first.into
+    maps = area(first.side), first.layer.into
     crop = body.input(f"input{first.number}", first.features or np.float32, maps)
-    label = body.input(f"label{first.number}", np.float32, (LABELS,))
+    label = body.input(f"label{first.number}", np.float32, (first.network.outputs,))
     add_crop(body, block, sgm, sums, crop, label)
     op = graph.within(f"layer{last.number}")
     nothing = [
@@ -146,12 +146,12 @@ def block_by_crops(
     found, (after,) = op.one_by_one(body, nothing, [crops, batch.labels])
     means = [op.Div(total, batch.size) for total in found]
     gradients = [Gradients(*pair) for pair in zip(means[::2], means[1::2], strict=True)]
-    return gradients, op.Reshape(after, op.shape(-1, last.channels))
+    return gradients, op.Reshape(after, op.shape(-1, last.layer.out))
 
 
 def gradient_shapes(layer: TunedLayer) -> tuple[tuple[int, int], tuple[int, int]]:
     """Of a layer's weight and bias."""
-    return (layer.channels, layer.width), (1, layer.channels)
+    return (layer.layer.out, layer.layer.window), (1, layer.layer.out)
 
 
 def declare_sums(body: Graph, layer: TunedLayer) -> tuple[Value, Value]:
@@ -169,20 +169,20 @@ def add_crop(
     sgm: AnySgm,
     sums: list[tuple[Value, Value]],
     crop: Value,  # (P, Ci)
-    label: Value,  # (3,)
+    label: Value,  # (L,)
 ) -> None:
     """Declare the sums with this crop's gradients, and what the block gives for it, (P', C)."""
     last = block[-1]
     op = body.within(f"layer{last.number}")
     passes = forward_all(body, block, crop)
-    labels = op.Reshape(label, op.shape(1, LABELS))
-    gradient = sgm_gradient(op, sgm, last.after_side, passes[-1].after, labels)
+    labels = op.Reshape(label, op.shape(1, last.network.outputs))
+    gradient = sgm_gradient(op, sgm, passes[-1].after, labels, last.network.outputs)
     found = carried_back(body, block, passes, gradient)
     for layer, so_far, one in zip(block, sums, found, strict=True):
         totals = plus(op, one.weight, so_far[0], 1.0), plus(op, one.bias, so_far[1], 1.0)
         for name, total, shape in zip(so_far, totals, gradient_shapes(layer), strict=True):
             body.output(f"{name}_next", total, np.float32, shape)
-    shape = last.after_side**2, last.channels
+    shape = last.positions_after, last.layer.out
     body.output(f"after{last.number}", passes[-1].after, np.float32, shape)
 
 
@@ -207,14 +207,14 @@ def update_layer(
     graph: Graph,
     layer: TunedLayer,
     summed: Gradients,
-    curvatures: Mapping[int, Curvature],
+    curvatures: Mapping[int, CurvatureArrays],
     optimizer: Optimizer,
     rule: Rule,
 ) -> None:
     """One layer's update."""
     op = graph.within(f"layer{layer.number}")
     if layer.number in curvatures:
-        gradients = bent_gradients(op, layer, summed, curvatures[layer.number])
+        gradients = preconditioned_gradients(op, layer, summed, curvatures[layer.number])
     else:
         gradients = weight_gradients(op, layer, summed)
     rate = op.graph.input(f"rate{layer.number}", np.float32, ())
@@ -227,7 +227,8 @@ def update_layer(
             op.graph.output(f"{name}_next", result, np.float32, shape)
         return next_value
 
-    weight = update(layer.weight, "weight", gradients.weight, (layer.channels, layer.width))
-    op.graph.output(f"{layer.weight}_next", weight, np.float32, (layer.channels, layer.width))
-    bias = op.Squeeze(update(layer.bias, "bias", gradients.bias, (1, layer.channels)), op.shape(0))
-    op.graph.output(f"{layer.bias}_next", bias, np.float32, (layer.channels,))
+    shapes = gradient_shapes(layer)
+    weight = update(layer.weight, "weight", gradients.weight, shapes[0])
+    op.graph.output(f"{layer.weight}_next", weight, np.float32, shapes[0])
+    bias = op.Squeeze(update(layer.bias, "bias", gradients.bias, shapes[1]), op.shape(0))
+    op.graph.output(f"{layer.bias}_next", bias, np.float32, (layer.layer.out,))

@@ -11,22 +11,16 @@ from torch.nn import functional as F
 
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import cut_patch
+from qsgm.task import Heads
 from qsgm.train.grasp.decision import JudgedScene
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, USUAL, Episode, EpisodeMaker
-from qsgm.train.model.graspnet import (
-    KERNELS,
-    LAYERS,
-    POOL,
-    POOL_AFTER_LAYER,
-    STRIDES,
-    GraspNet,
-    Loss,
-    normalize,
-)
+from qsgm.train.grasp.task import DrawnGrasping, frame_lesson, shipped_things
+from qsgm.train.heads import activate
 from qsgm.train.model.local import LayerState
+from qsgm.train.model.net import ConvNet, normalize
 from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune
-from qsgm.train.pretraining.tasks import Task, TaskSet, make_task, shipped_things
+from qsgm.train.pretraining.tasks import SeenLesson, TaskSet, see_lesson
 
 
 @dataclass(frozen=True)
@@ -42,7 +36,7 @@ class DecisionScenesConfig:
 
 
 def judged_scenes(
-    net: GraspNet,
+    net: ConvNet,
     rule: UpdateRule,
     start: Sequence[tuple[Tensor, Tensor]],
     config: DecisionScenesConfig,
@@ -66,13 +60,13 @@ def judged_scenes(
         episodes = [maker.draw(number, config.scenes, without=True) for number in numbers]
         taught = _teach(net, rule, start, episodes, config, seed)
         for number, episode, states in zip(numbers, episodes, taught, strict=True):
-            judged += _judge_all(number, episode, net, states, rule.loss)
+            judged += _judge_all(number, episode, net, states, rule.task.heads)
             after_episode()
     return judged
 
 
 def _teach(
-    net: GraspNet,
+    net: ConvNet,
     rule: UpdateRule,
     start: Sequence[tuple[Tensor, Tensor]],
     episodes: Sequence[Episode],
@@ -80,7 +74,7 @@ def _teach(
     seed: int,
 ) -> Iterator[list[LayerState]]:
     """The tuned layers of every episode."""
-    tasks = [_task(net, episode, len(start), config, rule.loss, seed) for episode in episodes]
+    tasks = [_task(net, episode, len(start), config, rule, seed) for episode in episodes]
     together = TaskSet(
         torch.stack([task.features for task in tasks]),
         torch.stack([task.labels for task in tasks]),
@@ -92,37 +86,30 @@ def _teach(
 
 
 def _task(
-    net: GraspNet,
+    net: ConvNet,
     episode: Episode,
     tuned: int,
     config: DecisionScenesConfig,
-    loss: Loss,
+    rule: UpdateRule,
     seed: int,
-) -> Task:
-    rng = np.random.default_rng(seed)
-    frame = episode.demonstration.image
-    return make_task(
-        net,
-        frame,
-        rng,
-        last_frozen=LAYERS - tuned,
-        count=config.crops,
-        loss=loss,
-        things=shipped_things(),
-    )
+) -> SeenLesson:
+    rng, frame = np.random.default_rng(seed), episode.demonstration.image
+    assert isinstance(rule.task, DrawnGrasping), "scenes are drawn of objects to grasp"
+    lesson = frame_lesson(frame, rng, config.crops, rule.task, things=shipped_things())
+    return see_lesson(net, lesson, net.network.depth - tuned, rule.task)
 
 
 def _judge_all(
     number: int,
     episode: Episode,
-    net: GraspNet,
+    net: ConvNet,
     states: Sequence[LayerState],
-    loss: Loss,
+    heads: Heads,
 ) -> Iterator[JudgedScene]:
     appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
 
     def judged(scene: DrawnScene, center_px: tuple[float, float] | None) -> JudgedScene:
-        seen = heatmap_of(net, states, scene.image, loss)
+        seen = heatmap_of(net, states, scene.image, heads)
         found = judge(appearance, scene.image, seen)
         return JudgedScene(number, center_px, tuple(found))
 
@@ -134,18 +121,19 @@ def _judge_all(
 
 @torch.no_grad()
 def heatmap_of(
-    net: GraspNet, states: Sequence[LayerState], frame: NDArray[np.uint8], loss: Loss
+    net: ConvNet, states: Sequence[LayerState], frame: NDArray[np.uint8], heads: Heads
 ) -> NDArray[np.float32]:
     """Quality, sine and cosine (3, rows, cols) of a frame (H, W, 3) by one task's tuned layers."""
-    first = LAYERS - len(states) + 1
-    x = net.between(normalize(torch.from_numpy(frame[None])), 1, first - 1)
-    for layer, state in enumerate(states, start=first):
-        kernel, stride = KERNELS[layer - 1], STRIDES[layer - 1]
-        weight = state.weight[0].view(kernel, kernel, x.shape[1], -1).permute(3, 2, 0, 1)
-        x = F.conv2d(x, weight, state.bias[0], stride)
-        x = x if layer == LAYERS else F.relu(x)
-        x = F.avg_pool2d(x, POOL, stride=1) if layer == POOL_AFTER_LAYER else x
-    heatmap: NDArray[np.float32] = loss.activate(x)[0].numpy()
+    numbers = net.network.last(len(states))
+    pixels = normalize(torch.from_numpy(frame[None]).permute(0, 3, 1, 2))
+    x = net.between(pixels, 1, numbers[0] - 1)
+    for number, state in zip(numbers, states, strict=True):
+        layer = net.network.layer(number)
+        weight = state.weight[0].view(*layer.kernel, layer.into, layer.out).permute(3, 2, 0, 1)
+        x = F.conv2d(x, weight, state.bias[0], layer.stride, padding=layer.padding)
+        x = F.relu(x) if layer.relu else x
+        x = F.avg_pool2d(x, layer.pool, layer.pool_stride)
+    heatmap: NDArray[np.float32] = activate(heads, x[0].permute(1, 2, 0)).permute(2, 0, 1).numpy()
     return heatmap
 
 

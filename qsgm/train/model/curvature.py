@@ -13,23 +13,23 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import CHANNELS, KERNELS
+from qsgm.network import Layer
+from qsgm.train.model.arrays import CurvatureArrays
 
 
 @dataclass(frozen=True)
 class Curvature:
     """One layer's matrices; each multiplies its axis of the gradient from the right."""
 
-    window: Tensor  # (k * k, k * k), positions of the kernel
+    window: Tensor  # (kh * kw, kh * kw), positions of the kernel
     into: Tensor  # (C_in, C_in)
     out: Tensor  # (C_out, C_out)
     bias: Tensor  # (C_out, C_out)
 
     @staticmethod
-    def identity(layer: int) -> "Curvature":
+    def identity(layer: Layer) -> "Curvature":
         """Plain gradient descent."""
-        into, out = CHANNELS[layer - 1], CHANNELS[layer]
-        sides = KERNELS[layer - 1] ** 2, into, out, out
+        sides = layer.kernel[0] * layer.kernel[1], layer.into, layer.out, layer.out
         return Curvature(*(torch.eye(side) for side in sides))
 
     @property
@@ -37,8 +37,12 @@ class Curvature:
         """Window, into, out, bias."""
         return self.window, self.into, self.out, self.bias
 
-    def bend(self, d_weight: Tensor, d_bias: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients of weight (T, K, C_out), K ordered (k, k, C_in), and bias (T, C_out)."""
+    def arrays(self) -> CurvatureArrays:
+        """Plain arrays, as graphs take them."""
+        return CurvatureArrays(*(matrix.detach().numpy() for matrix in self.matrices))
+
+    def precondition(self, d_weight: Tensor, d_bias: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients of weight (T, K, C_out), K ordered (kh, kw, C_in), and bias (T, C_out)."""
         tasks, _, channels = d_weight.shape
         windows = d_weight.view(tasks, len(self.window), len(self.into), channels) @ self.out
         windows = windows.transpose(2, 3) @ self.into  # (T, k * k, C_out, C_in)

@@ -1,84 +1,43 @@
-"""Fold batchnorm into the convolutions in front of it.
+"""Fold batchnorm into the convolutions in front of it, and write folded weights back.
 
-Batchnorm with running statistics is an affine map per channel, so a convolution can absorb it.
-Where the first layer is frozen it can absorb x / 127.5 - 1 as well (:func:`on_pixels`): it has no
-padding, so every window sees the same offset. Tuned it sees pixels in [-1, 1], as in pretraining:
-the same rate means other steps on raw pixels. Sums are done in float64, results are float32.
+Batchnorm with running statistics is an affine map per channel, so a convolution can absorb it. Sums
+are done in float64, results are float32.
 
 Contract. Before: every batchnorm stands right behind a convolution and has finite running
 statistics with a positive variance. After: convolutions, biases, ReLU and pooling, nothing else.
+
+The device trains folded weights, so meta-training has to as well. What it learns is written back
+in front of the batchnorm it was folded with, which is what `sgm.pt` keeps.
 """
 
 import copy
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qsgm.errors import QsgmError
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm
-from qsgm.train.model.graspnet import POOL, GraspNet, Layer, normalize
+from qsgm.train.model.arrays import FoldedLayer, FoldedNet
+from qsgm.train.model.net import ConvLayer, ConvNet, as_seen
 from qsgm.train.model.sgm import Sgm
 
-PIXEL_SCALE = 1 / 127.5
-PIXEL_OFFSET = -1.0
 
-
-@dataclass(frozen=True)
-class FoldedLayer:
-    """A convolution without padding, then ReLU and an average pool of stride 1 where set."""
-
-    weight: FloatArray  # (Co, Ci, kh, kw)
-    bias: FloatArray  # (Co,)
-    stride: int
-    relu: bool
-    pool: int  # side of the pooling window; 1: none
-
-
-@dataclass(frozen=True)
-class FoldedNet:
-    """The six layers; the first takes BGR pixels in [-1, 1], see :func:`on_pixels`."""
-
-    layers: tuple[FoldedLayer, ...]
-    # By layer, (Co,): what one step of each channel stands for where its output is kept in u8, see
-    # :mod:`qsgm.train.quantization.trunk`. Features of a layer that is not here are float32.
-    feature_steps: Mapping[int, FloatArray] = field(default_factory=dict)
-
-
-def fold_net(net: GraspNet) -> FoldedNet:
+def fold_net(net: ConvNet) -> FoldedNet:
     """Fold batchnorm. Raises QsgmError where the contract is broken."""
-    layers = [layer for layer in net.layers if isinstance(layer, Layer)]
+    layers = conv_layers(net)
     refuse_other_norms(net, (layer.norm for layer in layers))
-    return FoldedNet(tuple(fold_layer(number, layer) for number, layer in enumerate(layers, 1)))
+    folded = (fold_layer(number, layer) for number, layer in enumerate(layers, 1))
+    return FoldedNet(net.network, tuple(folded))
 
 
-def fold_layer(number: int, layer: Layer) -> FoldedLayer:
+def fold_layer(number: int, layer: ConvLayer) -> FoldedLayer:
     """One layer, numbered from 1."""
     weight, bias = as_float64(layer.conv)
     if layer.norm is not None:
         weight, bias = absorb_norm(weight, bias, layer.norm, f"layer {number}")
-    return FoldedLayer(
-        *as_float32(f"layer {number}", weight, bias),
-        stride=layer.conv.stride[0],
-        relu=layer.norm is not None,
-        pool=1 if layer.pool is None else POOL,
-    )
-
-
-def on_pixels(net: FoldedNet) -> FoldedNet:
-    """The same network on raw BGR pixel values, 0 to 255: the first layer normalises them."""
-    first = net.layers[0]
-    weight = first.weight.astype(np.float64)
-    bias = first.bias + PIXEL_OFFSET * weight.sum(axis=(1, 2, 3))
-    absorbed = replace(
-        first,
-        weight=(weight * PIXEL_SCALE).astype(np.float32),
-        bias=bias.astype(np.float32),
-    )
-    return replace(net, layers=(absorbed, *net.layers[1:]))
+    return FoldedLayer(*as_float32(f"layer {number}", weight, bias))
 
 
 def fold_sgm(sgm: Sgm) -> FoldedSgm:
@@ -88,14 +47,16 @@ def fold_sgm(sgm: Sgm) -> FoldedSgm:
     folded = [as_float64(conv) for conv in convolutions(sgm)]
     for i, norm in enumerate(batchnorms(sgm)):
         folded[i] = absorb_norm(*folded[i], norm, where)
-    return FoldedSgm(sgm.layer, tuple(FoldedConv(*as_float32(where, *conv)) for conv in folded))
+    return FoldedSgm(
+        sgm.layer, sgm.side, tuple(FoldedConv(*as_float32(where, *conv)) for conv in folded)
+    )
 
 
-def net_fold_error(net: GraspNet, folded: FoldedNet, crops: Tensor) -> float:
-    """Largest |difference| of raw outputs before and after folding; crops uint8 (N, H, W, 3)."""
+def net_fold_error(net: ConvNet, folded: FoldedNet, inputs: Tensor) -> float:
+    """Largest |difference| of raw outputs before and after folding; inputs (N, H, W, C)."""
     with torch.no_grad():
-        before = copy.deepcopy(net).eval()(normalize(crops))
-        after = run_folded(folded, crops)
+        before = copy.deepcopy(net).eval()(as_seen(net.network, inputs))
+        after = run_folded(folded, inputs)
     return float((before - after).abs().max())
 
 
@@ -106,7 +67,7 @@ def sgm_fold_error(sgm: Sgm, folded: FoldedSgm, activation: Tensor, labels: Tens
         sgm: as trained.
         folded: what :func:`fold_sgm` made of it.
         activation: (N, C, H, W).
-        labels: (N, 3).
+        labels: (N, L).
     """
     with torch.no_grad():
         before = copy.deepcopy(sgm).eval()(activation, labels)
@@ -114,18 +75,25 @@ def sgm_fold_error(sgm: Sgm, folded: FoldedSgm, activation: Tensor, labels: Tens
     return float((before - after).abs().max())
 
 
-def run_folded(folded: FoldedNet, crops: Tensor) -> Tensor:
-    """Raw outputs (N, 3, rows, cols) of the folded network on pixels (N, H, W, 3)."""
-    x = normalize(crops)
-    for layer in folded.layers:
-        x = F.conv2d(x, torch.tensor(layer.weight), torch.tensor(layer.bias), layer.stride)
-        x = F.relu(x) if layer.relu else x
-        x = F.avg_pool2d(x, layer.pool, stride=1)
+def run_folded(folded: FoldedNet, inputs: Tensor) -> Tensor:
+    """Raw outputs (N, O, rows, cols) of the folded network on inputs (N, H, W, C)."""
+    x = as_seen(folded.network, inputs)
+    for number in range(1, folded.network.depth + 1):
+        _, x = run_folded_layer(folded, number, x)
     return x
 
 
+def run_folded_layer(folded: FoldedNet, number: int, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Maps (N, Ci, H, W) in front of a layer's pool, and behind it."""
+    layer, arrays = folded.network.layer(number), folded.layers[number - 1]
+    weight, bias = torch.from_numpy(arrays.weight), torch.from_numpy(arrays.bias)
+    convolved = F.conv2d(x, weight, bias, layer.stride, padding=layer.padding)
+    convolved = F.relu(convolved) if layer.relu else convolved
+    return convolved, F.avg_pool2d(convolved, layer.pool, layer.pool_stride)
+
+
 def run_folded_sgm(folded: FoldedSgm, activation: Tensor, labels: Tensor) -> Tensor:
-    """Activation (N, C, H, W) and labels (N, 3) to gradients (N, C, H, W)."""
+    """Activation (N, C, H, W) and labels (N, L) to gradients (N, C, H, W)."""
     filled = labels[:, :, None, None].expand(-1, -1, *activation.shape[2:])
     x = torch.cat([activation, filled], dim=1)
     for conv in folded.convs[:-1]:
@@ -135,7 +103,7 @@ def run_folded_sgm(folded: FoldedSgm, activation: Tensor, labels: Tensor) -> Ten
 
 def run_folded_conv(conv: FoldedConv, x: Tensor) -> Tensor:
     """x (N, I, H, W) to (N, O, H, W)."""
-    pad = conv.weight.shape[2] // 2
+    pad = [side // 2 for side in conv.weight.shape[2:]]
     return F.conv2d(x, torch.tensor(conv.weight), torch.tensor(conv.bias), padding=pad)
 
 
@@ -192,3 +160,50 @@ def refuse_other_norms(module: nn.Module, folded: Iterable[nn.Module | None]) ->
                 f"batchnorm {name!r} does not stand behind a convolution of its own:"
                 " it cannot be folded; use the network as this version builds it"
             )
+
+
+def conv_layers(net: ConvNet) -> list[ConvLayer]:
+    """A network's layers, in order."""
+    return [layer for layer in net.layers if isinstance(layer, ConvLayer)]
+
+
+def folded_start(net: ConvNet, tuned: int) -> list[tuple[Tensor, Tensor]]:
+    """Weight (K, Co), rows ordered (kh, kw, Ci), and bias (Co,) of each of the last layers."""
+    start = []
+    for layer in _last(net, tuned):
+        gain, shift = _affine(layer)
+        weight = layer.conv.weight.detach() * gain[:, None, None, None]
+        flat = weight.permute(2, 3, 1, 0).reshape(-1, weight.shape[0])
+        start.append((flat.contiguous(), _bias(layer) * gain + shift))
+    return start
+
+
+@torch.no_grad()
+def write_back(net: ConvNet, start: Sequence[tuple[Tensor, Tensor]]) -> None:
+    """Give the last layers convolutions that fold to `start`; the inverse of `folded_start`."""
+    for layer, (weight, bias) in zip(_last(net, len(start)), start, strict=True):
+        gain, shift = _affine(layer)
+        out, into, height, width = layer.conv.weight.shape
+        maps = weight.view(height, width, into, out).permute(3, 2, 0, 1)
+        layer.conv.weight.copy_(maps / gain[:, None, None, None])
+        _bias(layer).copy_((bias - shift) / gain)
+
+
+def _last(net: ConvNet, tuned: int) -> list[ConvLayer]:
+    return conv_layers(net)[-tuned:]
+
+
+def _affine(layer: ConvLayer) -> tuple[Tensor, Tensor]:
+    """Gain and shift (Co,) of a layer's batchnorm: norm(x) = gain * x + shift."""
+    norm = layer.norm
+    if norm is None:
+        return torch.ones_like(_bias(layer)), torch.zeros_like(_bias(layer))
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    gain = norm.weight.detach() / torch.sqrt(norm.running_var + norm.eps)
+    return gain, norm.bias.detach() - gain * norm.running_mean
+
+
+def _bias(layer: ConvLayer) -> Tensor:
+    assert layer.conv.bias is not None
+    return layer.conv.bias.detach()

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from qsgm.network import ONE, Network, Pair
+from qsgm.task import Heads
+from qsgm.train import heads as losses
 from qsgm.train.model.curvature import FLAT, Curvature
-from qsgm.train.model.graspnet import KERNELS, LAYERS, POOL_AFTER_LAYER, STRIDES, Loss
 
 # (layer, activation (T, B, P, C), labels (T, B, 3)) -> gradient of each sample's loss, same shape
 GradientOf = Callable[[int, Tensor, Tensor], Tensor]
@@ -42,42 +44,60 @@ class LayerState:
         )
 
 
-def im2col_index(side: int, kernel: int, stride: int) -> Tensor:
-    """Positions (P_out, kernel * kernel) of a square map that each window of it covers."""
-    start = torch.arange(0, side - kernel + 1, stride)
-    base = (start[:, None] * side + start[None, :]).reshape(-1, 1)
-    step = torch.arange(kernel)
-    return base + (step[:, None] * side + step[None, :]).reshape(1, -1)
+def window_index(side: Pair, kernel: Pair, stride: Pair) -> Tensor:
+    """Positions (P_out, kh * kw) of a map of this size that each window of it covers."""
+    (height, width), (tall, wide) = side, kernel
+    rows = torch.arange(0, height - tall + 1, stride[0])
+    columns = torch.arange(0, width - wide + 1, stride[1])
+    base = (rows[:, None] * width + columns[None, :]).reshape(-1, 1)
+    steps = torch.arange(tall)[:, None] * width + torch.arange(wide)[None, :]
+    return base + steps.reshape(1, -1)
 
 
-def columns(layer: int, x: Tensor) -> Tensor:
+def columns(network: Network, number: int, x: Tensor) -> Tensor:
     """The windows (T, B, P_out, K) that a layer sees of its input (T, B, P, C_in)."""
-    kernel = KERNELS[layer - 1]
-    if kernel == 1:
+    layer, (height, width) = network.layer(number), network.before(number)
+    if (layer.kernel, layer.stride, layer.padding) == (ONE, ONE, (0, 0)):
         return x
-    side = int(x.shape[2] ** 0.5)
-    index = im2col_index(side, kernel, STRIDES[layer - 1])
-    return x[:, :, index].flatten(3)
+    up, left = layer.padding
+    if up or left:
+        x = F.pad(x.unflatten(2, (height, width)), (0, 0, left, left, up, up)).flatten(2, 3)
+    side = height + 2 * up, width + 2 * left
+    return x[:, :, window_index(side, layer.kernel, layer.stride)].flatten(3)
 
 
-def layer_forward(layer: int, state: LayerState, col: Tensor) -> tuple[Tensor, Tensor]:
-    """Pre-activation (T, B, P, C_out) and activation, pooled to one position after layer 4."""
+def layer_forward(
+    network: Network, number: int, state: LayerState, col: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pre-activation (T, B, P, C_out) and activation, behind ReLU and pool."""
+    layer = network.layer(number)
     tasks, batch, positions, width = col.shape
     flat = torch.baddbmm(state.bias[:, None], col.reshape(tasks, -1, width), state.weight)
     before = flat.reshape(tasks, batch, positions, -1)
-    if layer == LAYERS:
-        return before, before
-    after = torch.relu(before)
-    return before, after.mean(dim=2, keepdim=True) if layer == POOL_AFTER_LAYER else after
+    after = torch.relu(before) if layer.relu else before
+    if layer.pool == ONE:
+        return before, after
+    if network.pools_all(number):
+        return before, after.mean(dim=2, keepdim=True)
+    return before, after[:, :, pool_index(network, number)].mean(dim=3)
 
 
-def through_activation(layer: int, before: Tensor, gradient: Tensor) -> Tensor:
+def pool_index(network: Network, number: int) -> Tensor:
+    """Positions (P', kh * kw) of a layer's convolved map that each window of its pool covers."""
+    layer = network.layer(number)
+    return window_index(network.convolved(number), layer.pool, layer.pool_stride)
+
+
+def through_activation(network: Network, number: int, before: Tensor, gradient: Tensor) -> Tensor:
     """The gradient on a layer's activation carried back to its pre-activation."""
-    if layer == LAYERS:
-        return gradient
-    if layer == POOL_AFTER_LAYER:
+    layer = network.layer(number)
+    if network.pools_all(number):
         gradient = gradient / before.shape[2]
-    return gradient * (before > 0)
+    elif layer.pool != ONE:
+        index = pool_index(network, number)
+        share = (gradient / index.shape[1])[:, :, :, None].expand(-1, -1, -1, index.shape[1], -1)
+        gradient = torch.zeros_like(before).index_add(2, index.flatten(), share.flatten(2, 3))
+    return gradient * (before > 0) if layer.relu else gradient
 
 
 def weight_gradients(col: Tensor, dz: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,24 +107,8 @@ def weight_gradients(col: Tensor, dz: Tensor) -> tuple[Tensor, Tensor]:
     return flat_col.transpose(1, 2) @ flat_dz / batch, flat_dz.sum(dim=1) / batch
 
 
-def loss_gradient(loss: Loss, raw: Tensor, labels: Tensor) -> Tensor:
-    """d loss / d raw outputs, per sample; (..., 3) each."""
-    quality = torch.sigmoid(raw[..., :1]) - (
-        labels[..., :1] * (1 - loss.label_smoothing) + loss.label_smoothing / 2
-    )
-    sine = torch.tanh(raw[..., 1:2])
-    d_sine = (sine - labels[..., 1:2]) * (1 - sine.square())
-    if loss.encoding == "double":
-        cosine = torch.tanh(raw[..., 2:])
-        d_cosine = (cosine - labels[..., 2:]) * (1 - cosine.square())
-    else:
-        cosine = torch.sigmoid(raw[..., 2:])
-        d_cosine = (cosine - labels[..., 2:]) * cosine * (1 - cosine)
-    angle = 2 * loss.angle_weight * labels[..., :1] * torch.cat([d_sine, d_cosine], dim=-1)
-    return torch.cat([quality, angle], dim=-1)
-
-
 def local_step(
+    network: Network,
     states: Sequence[LayerState],
     features: Tensor,
     labels: Tensor,
@@ -116,22 +120,23 @@ def local_step(
     """One feed-forward training step: every layer updates itself before the next one runs.
 
     Args:
-        states: the tuned layers, in order; the last of them is layer 6.
+        network: whose last layers these are.
+        states: the tuned layers, in order.
         features: (T, B, P, C), input of the first tuned layer.
-        labels: (T, B, 3).
+        labels: (T, B, L).
         rates: one learning rate per layer, a scalar or one per task, (T,).
-        gradient_of: where the gradient on an activation comes from (layer 6: the loss).
+        gradient_of: where the gradient on an activation comes from (the last one: the loss).
         momentum: of SGD.
         curvatures: by layer, where there is one.
     """
     updated, x = [], features
-    for layer, state, rate in zip(_numbers(states), states, rates, strict=True):
-        col = columns(layer, x)
-        before, x = layer_forward(layer, state, col)
-        dz = through_activation(layer, before, gradient_of(layer, x, labels))
+    for layer, state, rate in zip(network.last(len(states)), states, rates, strict=True):
+        col = columns(network, layer, x)
+        before, x = layer_forward(network, layer, state, col)
+        dz = through_activation(network, layer, before, gradient_of(layer, x, labels))
         gradients = weight_gradients(col, dz)
         if layer in curvatures:
-            gradients = curvatures[layer].bend(*gradients)
+            gradients = curvatures[layer].precondition(*gradients)
         updated.append(sgd(state, *gradients, rate, momentum))
     return updated
 
@@ -150,43 +155,46 @@ def sgd(
     )
 
 
-def outputs(states: Sequence[LayerState], features: Tensor) -> Tensor:
-    """Raw outputs (T, B, 3) of the tuned layers."""
+def outputs(network: Network, states: Sequence[LayerState], features: Tensor) -> Tensor:
+    """Raw outputs (T, B, O) of the tuned layers, whose last one has one position."""
     x = features
-    for layer, state in zip(_numbers(states), states, strict=True):
-        _, x = layer_forward(layer, state, columns(layer, x))
+    for layer, state in zip(network.last(len(states)), states, strict=True):
+        _, x = layer_forward(network, layer, state, columns(network, layer, x))
     return x[:, :, 0]
 
 
 def true_gradients(
-    states: Sequence[LayerState], features: Tensor, labels: Tensor, loss: Loss
+    network: Network,
+    states: Sequence[LayerState],
+    features: Tensor,
+    labels: Tensor,
+    heads: Heads,
 ) -> dict[int, Tensor]:
     """Per-sample gradients on every tuned layer's activation by backpropagation, written out."""
     inputs, befores, x = {}, {}, features
-    for layer, state in zip(_numbers(states), states, strict=True):
+    layers = list(zip(network.last(len(states)), states, strict=True))
+    for layer, state in layers:
         inputs[layer] = x
-        befores[layer], x = layer_forward(layer, state, columns(layer, x))
-    gradients = {LAYERS: loss_gradient(loss, x, labels[:, :, None])}
-    for layer, state in list(zip(_numbers(states), states, strict=True))[:0:-1]:
-        dz = through_activation(layer, befores[layer], gradients[layer])
+        befores[layer], x = layer_forward(network, layer, state, columns(network, layer, x))
+    gradients = {network.depth: losses.error(heads, x, labels[:, :, None])}
+    for layer, state in layers[:0:-1]:
+        dz = through_activation(network, layer, befores[layer], gradients[layer])
         d_columns = dz @ state.weight.transpose(1, 2)[:, None]
-        gradients[layer - 1] = sum_windows(layer, d_columns, inputs[layer].shape[2])
+        gradients[layer - 1] = sum_windows(network, layer, d_columns)
     return gradients
 
 
-def sum_windows(layer: int, windows: Tensor, positions: int) -> Tensor:
+def sum_windows(network: Network, number: int, windows: Tensor) -> Tensor:
     """The transpose of :func:`columns`: windows (T, B, P_out, K) added up where they overlap.
 
-    Returns (T, B, P, C_in) with P = `positions`, a square map.
+    Returns (T, B, P, C_in).
     """
-    kernel, side = KERNELS[layer - 1], round(positions**0.5)
-    if kernel == 1:
+    layer, side = network.layer(number), network.before(number)
+    if (layer.kernel, layer.stride, layer.padding) == (ONE, ONE, (0, 0)):
         return windows
-    by_channel = windows.unflatten(3, (kernel * kernel, -1)).flatten(0, 1).permute(0, 3, 2, 1)
-    channels_first = by_channel.flatten(1, 2)
-    maps = F.fold(channels_first, (side, side), kernel, stride=STRIDES[layer - 1])
-    return maps.flatten(2).transpose(1, 2).reshape(*windows.shape[:2], positions, -1)
-
-
-def _numbers(states: Sequence[LayerState]) -> range:
-    return range(LAYERS - len(states) + 1, LAYERS + 1)
+    taps = layer.kernel[0] * layer.kernel[1]
+    by_channel = windows.unflatten(3, (taps, -1)).flatten(0, 1).permute(0, 3, 2, 1)
+    maps = F.fold(
+        by_channel.flatten(1, 2), side, layer.kernel, padding=layer.padding, stride=layer.stride
+    )
+    return maps.flatten(2).transpose(1, 2).reshape(*windows.shape[:2], maps[0, 0].numel(), -1)

@@ -2,8 +2,8 @@
 
 An SGM sees a layer's activation and the label, each label value filling a channel of its own,
 and answers with the gradient of every sample's loss with respect to that activation. It is a
-stack of convolutions with batchnorm and ReLU between: (C + 3) -> hidden ... -> C, 3x3 behind
-layers 1-3, 1x1 behind layers 4 and 5. One hidden convolution as wide as the layer is the paper's
+stack of convolutions with batchnorm and ReLU between: (C + L) -> hidden ... -> C, 3x3 where the
+layer gives maps, else 1x1. One hidden convolution as wide as the layer is the paper's
 SGM; two wider ones are the default here (the README's design notes say why). The last layer has
 none: its gradient comes from the loss.
 """
@@ -16,34 +16,32 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import CHANNELS, LAYERS
-
-LABEL_CHANNELS = 3
-SGM_LAYERS = tuple(range(1, LAYERS))
-KERNEL_BEHIND_LAYER = {1: 3, 2: 3, 3: 3, 4: 1, 5: 1}
+from qsgm.network import Network
 
 
 class Sgm(nn.Module):
     """The module behind layer `layer`; without `hidden` widths, the paper's.
 
     Args:
-        layer: 1 to 5.
+        network: whose layer it is.
+        layer: from 1 to the last but one.
         hidden: channels of each hidden convolution.
     """
 
-    def __init__(self, layer: int, hidden: Sequence[int] | None = None) -> None:
+    def __init__(self, network: Network, layer: int, hidden: Sequence[int] | None = None) -> None:
         super().__init__()
-        self.layer = layer
-        self.hidden = tuple(hidden or (CHANNELS[layer],))
-        kernel = KERNEL_BEHIND_LAYER[layer]
-        widths = (CHANNELS[layer] + LABEL_CHANNELS, *self.hidden, CHANNELS[layer])
+        self.layer, self.side = layer, network.after(layer)
+        channels, kernel = network.layer(layer).out, network.sgm_kernel(layer)
+        self.hidden = tuple(hidden or (channels,))
+        padding = (kernel[0] // 2, kernel[1] // 2)
+        widths = (channels + network.outputs, *self.hidden, channels)
         self.convs = nn.ModuleList(
-            nn.Conv2d(into, out, kernel, padding=kernel // 2) for into, out in pairwise(widths)
+            nn.Conv2d(into, out, kernel, padding=padding) for into, out in pairwise(widths)
         )
         self.norms = nn.ModuleList(nn.BatchNorm2d(width) for width in self.hidden)
 
     def forward(self, activation: Tensor, labels: Tensor) -> Tensor:
-        """Activation (N, C, H, W) and labels (N, 3) to its gradient (N, C, H, W)."""
+        """Activation (N, C, H, W) and labels (N, L) to its gradient (N, C, H, W)."""
         filled = labels[:, :, None, None].expand(-1, -1, *activation.shape[2:])
         x = torch.cat([activation, filled], dim=1)
         for conv, norm in zip(self.convs[:-1], self.norms, strict=True):
@@ -69,7 +67,7 @@ class SgmLayer(nn.Module):
         self.sgm, self.teacher = sgm, teacher
 
     def forward(self, activation: Tensor, labels: Tensor) -> Tensor:
-        """Activation (N, C, H, W), returned as it is, and labels (N, 3).
+        """Activation (N, C, H, W), returned as it is, and labels (N, L).
 
         The network's loss has to be a mean over the N samples.
         """

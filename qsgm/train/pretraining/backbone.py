@@ -1,6 +1,6 @@
-"""Pretraining, first stage: GraspNet learns to find and orient drawn objects, by backpropagation.
+"""Pretraining, first stage: the network learns its task on drawn examples, by backpropagation.
 
-Every batch shows frames never drawn before, so there is nothing to memorise and no epoch.
+Every batch shows examples never drawn before, so there is nothing to memorise and no epoch.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from qsgm.train.model.graspnet import GraspNet, Loss, normalize
-from qsgm.train.pretraining.tasks import CropStream
+from qsgm.train.heads import mean_loss
+from qsgm.train.model.net import ConvNet, as_seen
+from qsgm.train.pretraining.tasks import ExampleStream
+from qsgm.train.task import DrawnTask
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,10 @@ class BackboneConfig:
 class BackboneTraining:
     """The first stage as a state that can be saved, resumed and advanced step by step."""
 
-    def __init__(self, config: BackboneConfig, loss: Loss, seed: int, device: str) -> None:
+    def __init__(self, config: BackboneConfig, task: DrawnTask, seed: int, device: str) -> None:
         torch.manual_seed(seed)
-        self.config, self.loss, self.seed, self.device = config, loss, seed, device
-        self.net = in_memory_format(GraspNet().to(device), torch.channels_last)
+        self.config, self.task, self.seed, self.device = config, task, seed, device
+        self.net = in_memory_format(ConvNet(task.network).to(device), torch.channels_last)
         self.optimizer = torch.optim.AdamW(
             self.net.parameters(), config.peak_rate, weight_decay=config.weight_decay
         )
@@ -42,11 +44,12 @@ class BackboneTraining:
         )
         self.step = 0
 
-    def run(self, after_step: Callable[[int, float], None]) -> GraspNet:
+    def run(self, after_step: Callable[[int, float], None]) -> ConvNet:
         """Train to the end; `after_step` gets the step's number and its loss."""
         self.net.train()
         for crops, labels in self._batches():
-            loss = self.loss(self._outputs(crops), labels.flatten(0, 1).to(self.device))
+            known = labels.flatten(0, 1).to(self.device)
+            loss = mean_loss(self.task.heads, self._outputs(crops), known)
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()
@@ -70,13 +73,13 @@ class BackboneTraining:
         self.schedule.load_state_dict(schedule)
 
     def _outputs(self, crops: Tensor) -> Tensor:
-        x = normalize(crops.flatten(0, 1).to(self.device))
+        x = as_seen(self.task.network, crops.flatten(0, 1).to(self.device))
         outputs: Tensor = self.net(x.contiguous(memory_format=torch.channels_last))[:, :, 0, 0]
         return outputs
 
     def _batches(self) -> Iterator[tuple[Tensor, Tensor]]:
         frames = self.config.steps * self.config.frames_per_batch
-        stream = CropStream(self.seed, frames, self.config.crops_per_frame, self.loss.encoding)
+        stream = ExampleStream(self.task, self.seed, frames, self.config.crops_per_frame)
         rest = torch.utils.data.Subset(
             stream, range(self.step * self.config.frames_per_batch, frames)
         )
@@ -90,7 +93,7 @@ class BackboneTraining:
         )
 
 
-def in_memory_format(net: GraspNet, memory_format: torch.memory_format) -> GraspNet:
+def in_memory_format(net: ConvNet, memory_format: torch.memory_format) -> ConvNet:
     """The same network with its weights laid out otherwise; torch's types do not know the call."""
     net.to(memory_format=memory_format)  # type: ignore[call-overload]
     return net

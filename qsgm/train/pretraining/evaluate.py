@@ -3,29 +3,29 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from qsgm.errors import QsgmError
-from qsgm.grasp.angles import AngleEncoding, angle_error, decode_angle
+from qsgm.schedule import MOMENTUM, rate_factor
+from qsgm.task import Task
+from qsgm.train.heads import activate, error, meta_objective
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.graspnet import LAYERS, Loss
-from qsgm.train.model.local import LayerState, local_step, loss_gradient, outputs
+from qsgm.train.model.local import LayerState, local_step, outputs
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.pretraining.maml import MOMENTUM, apply_sgm
+from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
-from qsgm.tune.loop import rate_factor
 
 
 @dataclass(frozen=True)
 class Score:
-    """Means over tasks, on their query crops."""
+    """On query samples."""
 
-    objective: float  # Loss.per_task
-    detection_accuracy: float
-    angle_mae_deg: float
+    objective: float  # see :func:`qsgm.train.heads.meta_objective`
+    scores: Mapping[str, Any]  # by the task's own names
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class UpdateRule:
     sgms: Mapping[int, Sgm]  # by layer
     curvatures: Mapping[int, Curvature]
     rates: tuple[float, ...]  # of the tuned layers, at the start of a run
-    loss: Loss
+    task: Task
 
     def gradient_of(self, layer: int, activation: Tensor, labels: Tensor) -> Tensor:
-        """Gradient (T, B, P, C) on a layer's activation; labels (T, B, 3)."""
-        if layer == LAYERS:
-            return loss_gradient(self.loss, activation, labels[:, :, None])
+        """Gradient (T, B, P, C) on a layer's activation; labels (T, B, L)."""
+        if layer == self.task.network.depth:
+            return error(self.task.heads, activation, labels[:, :, None])
         return apply_sgm(self.sgms[layer], activation, labels)
 
 
@@ -59,8 +59,9 @@ def fine_tune(
         features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
         factor = rate_factor(step - 1, len(batches))
         rates = [torch.tensor(rate * factor) for rate in rule.rates]
+        network, bent = rule.task.network, rule.curvatures
         states = local_step(
-            states, features, labels, rates, rule.gradient_of, MOMENTUM, rule.curvatures
+            network, states, features, labels, rates, rule.gradient_of, MOMENTUM, bent
         )
         if step % (len(batches) // epochs) == 0:
             yield states
@@ -77,29 +78,30 @@ def run_sgms(
     scores = []
     for some in tasks.chunks(chunk):
         *_, states = fine_tune(rule, start, some, epochs)
-        scores.append(score(states, some, rule.loss))
-    return Score(*torch.cat(scores).mean(dim=0).tolist())
+        scores += score(states, some, rule.task)
+    return mean_score(scores)
 
 
 @torch.no_grad()
-def score(states: Sequence[LayerState], tasks: TaskSet, loss: Loss) -> Tensor:
-    """Objective, detection accuracy and angle error [deg] on the query crops; (T, 3)."""
+def score(states: Sequence[LayerState], tasks: TaskSet, task: Task) -> list[Score]:
+    """Every task's score on its query samples."""
     features, labels = tasks.features[:, tasks.support :].float(), tasks.labels[:, tasks.support :]
-    raw = outputs(states, features)
-    seen = loss.activate(raw.flatten(0, 1)).view(labels.shape)
-    positive = labels[..., 0] > 0
-    detection = ((seen[..., 0] > 0.5) == positive).float().mean(dim=1)
-    error = _angle_error_deg(seen, labels, loss.encoding)
-    angle = (error * positive).sum(dim=1) / positive.sum(dim=1)
-    return torch.stack([loss.per_task(raw, labels), detection, angle], dim=1)
+    raw = outputs(task.network, states, features)
+    objectives = meta_objective(task.heads, raw, labels).tolist()
+    seen = activate(task.heads, raw)
+    return [
+        Score(objective, dict(task.scores(one.numpy(), known.numpy())))
+        for objective, one, known in zip(objectives, seen, labels, strict=True)
+    ]
 
 
-def _angle_error_deg(seen: Tensor, labels: Tensor, encoding: AngleEncoding) -> Tensor:
-    """Between outputs and labels (T, N, 3): (T, N), modulo 180 degrees whatever the encoding."""
-    predicted, true = (
-        decode_angle(x[..., 1].numpy(), x[..., 2].numpy(), encoding) for x in (seen, labels)
+def mean_score(scores: Sequence[Score]) -> Score:
+    """The mean of every figure."""
+    names = scores[0].scores
+    return Score(
+        float(np.mean([score.objective for score in scores])),
+        {name: float(np.mean([score.scores[name] for score in scores])) for name in names},
     )
-    return torch.from_numpy(np.degrees(angle_error(predicted, true))).to(seen.dtype)
 
 
 def best_rates(scores: Mapping[tuple[float, ...], Score]) -> tuple[float, ...]:

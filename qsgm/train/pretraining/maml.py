@@ -17,14 +17,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from qsgm.schedule import BATCH, MOMENTUM, rate_factor
+from qsgm.task import Task
+from qsgm.train.heads import error, meta_objective
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.graspnet import LAYERS, Loss
-from qsgm.train.model.local import LayerState, local_step, loss_gradient, outputs, true_gradients
+from qsgm.train.model.local import LayerState, local_step, outputs, true_gradients
+from qsgm.train.model.net import maps_of, positions_of
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.tasks import TaskSet
-from qsgm.tune.loop import BATCH, rate_factor
 
-MOMENTUM = 0.9
 # A run whose query loss is beyond this has blown up.
 LOST = 4.0
 
@@ -74,20 +75,20 @@ class MetaTraining:
     def __init__(
         self,
         config: MamlConfig,
-        loss: Loss,
+        task: Task,
         tasks: TaskSet,
         start: Sequence[tuple[Tensor, Tensor]],
         sgms: Mapping[int, Sgm],
         rates: Sequence[float],
         seed: int,
     ) -> None:
-        self.config, self.loss, self.tasks, self.sgms = config, loss, tasks, dict(sgms)
+        self.config, self.task, self.tasks, self.sgms = config, task, tasks, dict(sgms)
         self.start = [tuple(nn.Parameter(t.clone()) for t in layer) for layer in start]
         self.log_rates = nn.Parameter(torch.tensor(rates).log())
         self.first_log_rates = self.log_rates.detach().clone()
         self.curvatures = {
-            layer: _parameters(Curvature.identity(layer))
-            for layer in range(LAYERS + 1 - len(start), LAYERS + 1)
+            number: _parameters(Curvature.identity(task.network.layer(number)))
+            for number in task.network.last(len(start))
         }
         self.generator = torch.Generator().manual_seed(seed)
         count = config.tasks_per_step * config.runs_per_task_slot
@@ -218,7 +219,7 @@ class _Unrolled:
         self.lengths = [run.length for run in chosen]
         rows = [run.task for run in chosen]
         self.features = training.tasks.features[rows].to(training.log_rates.dtype)  # (T, N, P, C)
-        self.labels = training.tasks.labels[rows]  # (T, N, 3)
+        self.labels = training.tasks.labels[rows]  # (T, N, L)
         self.states = _join([run.states or self._start() for run in chosen])
         self.rates = training.log_rates.exp().unbind()
         self.way = torch.zeros(len(chosen))
@@ -228,19 +229,21 @@ class _Unrolled:
     def advance(self, generator: torch.Generator) -> None:
         """One feed-forward step of every run, on a random batch of its support set."""
         features, labels = self._batch(generator)
+        task = self.training.task
         with torch.no_grad():
-            true = true_gradients(self.states, features, labels, self.training.loss)
+            true = true_gradients(task.network, self.states, features, labels, task.heads)
         given: dict[int, Tensor] = {}
 
         def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
-            if layer == LAYERS:
+            if layer == task.network.depth:
                 given[layer] = activation
-                return loss_gradient(self.training.loss, activation, labels[:, :, None])
+                return error(task.heads, activation, labels[:, :, None])
             given[layer] = apply_sgm(self.training.sgms[layer], activation, labels)
             return given[layer]
 
         factor = self._rate_factors()
         self.states = local_step(
+            task.network,
             self.states,
             features,
             labels,
@@ -250,15 +253,15 @@ class _Unrolled:
             self.training.curvatures,
         )
         self.ages = [age + 1 for age in self.ages]
-        raw = given.pop(LAYERS)[:, :, 0]
-        self.way = self.way + self.training.loss.per_task(raw, labels)
+        raw = given.pop(task.network.depth)[:, :, 0]
+        self.way = self.way + meta_objective(task.heads, raw, labels)
         self._match(given, true)
 
     def query_loss(self) -> Tensor:
         """The objective (T,) on the crops held back."""
-        support = self.training.tasks.support
-        raw = outputs(self.states, self.features[:, support:])
-        return self.training.loss.per_task(raw, self.labels[:, support:])
+        support, task = self.training.tasks.support, self.training.task
+        raw = outputs(task.network, self.states, self.features[:, support:])
+        return meta_objective(task.heads, raw, self.labels[:, support:])
 
     def _match(self, given: dict[int, Tensor], true: dict[int, Tensor]) -> None:
         for layer, synthetic in given.items():
@@ -294,12 +297,9 @@ def _parameters(curvature: Curvature) -> Curvature:
 
 
 def apply_sgm(sgm: Sgm, activation: Tensor, labels: Tensor) -> Tensor:
-    """An SGM on the activations (T, B, P, C) of many tasks; P is a square map, row-major."""
-    tasks, batch, positions, channels = activation.shape
-    side = round(positions**0.5)
-    maps = activation.flatten(0, 1).transpose(1, 2).unflatten(2, (side, side))
-    gradient: Tensor = sgm(maps, labels.flatten(0, 1))
-    return gradient.flatten(2).transpose(1, 2).reshape(tasks, batch, positions, channels)
+    """An SGM on the activations (T, B, P, C) of many tasks, maps row by row."""
+    gradient = sgm(maps_of(activation.flatten(0, 1), sgm.side), labels.flatten(0, 1))
+    return positions_of(gradient).reshape(activation.shape)
 
 
 def _join(runs: list[list[LayerState]]) -> list[LayerState]:

@@ -1,8 +1,8 @@
-"""Pretraining, fourth stage: the SGMs behind layers 1 to 3 regress true gradients.
+"""Pretraining, fourth stage: SGMs in front of the meta-trained layers regress true gradients.
 
-Their layers learn slowly on the device, and what lies behind them soon is what layers 4 to 6 have
-become: they regress gradients carried back through layers 4 to 6 as those are before, during and
-after fine-tuning runs of three layers.
+Those early layers, which have maps, learn slowly on the device, and what lies behind them soon is
+what the late, meta-trained layers have become: their SGMs regress gradients carried back through
+the late layers as those are before, during and after fine-tuning runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,48 +12,50 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from qsgm.network import Network
 from qsgm.train.model.local import LayerState, columns, layer_forward, true_gradients
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, start_states
 
-EARLY = (1, 2, 3)
 SLICE = 20  # crops whose windows are in memory at once
 
 
 @dataclass(frozen=True)
-class EarlyConfig:
+class MapConfig:
     """Sizes and rates of the fourth stage."""
 
     tasks: int = 32
     crops_per_task: int = 120
-    epochs: int = 30  # of the runs of three layers
-    looks: tuple[int, ...] = (2, 8, 30)  # epochs after which layers 4 to 6 are looked at
+    epochs: int = 30  # of the late layers' runs
+    looks: tuple[int, ...] = (2, 8, 30)  # epochs after which those are looked at
     steps: int = 600
     tasks_per_step: int = 4
     crops_per_step: int = 8
     peak_rate: float = 1e-2
 
 
-class EarlyMatching:
-    """The fourth stage: what the three SGMs see is computed as it is needed, and dropped."""
+class MapMatching:
+    """The fourth stage: what these SGMs see is computed as it is needed, and dropped."""
 
     def __init__(
         self,
-        config: EarlyConfig,
+        config: MapConfig,
         rule: UpdateRule,
-        start: Sequence[tuple[Tensor, Tensor]],  # of all six layers
+        start: Sequence[tuple[Tensor, Tensor]],  # of all layers
         pixels: TaskSet,
         seed: int,
     ) -> None:
         self.config, self.rule, self.start, self.pixels = config, rule, start, pixels
+        network = rule.task.network
+        self.early = range(1, network.depth + 1 - len(rule.rates))
         self.behind = [self._late_states(some) for some in pixels.chunks(config.tasks_per_step)]
         torch.manual_seed(seed)
-        self.sgms = {layer: Sgm(layer) for layer in EARLY}
+        self.sgms = {layer: Sgm(network, layer) for layer in self.early}
         self.generator = torch.Generator().manual_seed(seed)
         _, _, true = self._batch()
-        self.unit = {layer: float(true[layer].square().mean().sqrt()) for layer in EARLY}
+        self.unit = {layer: float(true[layer].square().mean().sqrt()) for layer in self.early}
         parameters = [p for sgm in self.sgms.values() for p in sgm.parameters()]
         self.optimizer = torch.optim.Adam(parameters)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -89,7 +91,7 @@ class EarlyMatching:
 
     @torch.no_grad()
     def _batch(self) -> tuple[dict[int, Tensor], Tensor, dict[int, Tensor]]:
-        """Activations and true gradients of the early layers (T, B, P, C), and labels (T, B, 3)."""
+        """Activations and true gradients of the early layers (T, B, P, C), and labels (T, B, L)."""
         group = self._draw(len(self.behind))
         moments = self.behind[group]
         late = moments[self._draw(len(moments))]
@@ -99,18 +101,20 @@ class EarlyMatching:
         rows = rows[: self.config.crops_per_step]
         x = self.pixels.features[tasks][:, rows].float()
         labels = self.pixels.labels[tasks][:, rows]
-        states = start_states(self.start[: len(EARLY)], len(labels)) + late
-        true = true_gradients(states, x, labels, self.rule.loss)
+        states = start_states(self.start[: len(self.early)], len(labels)) + late
+        task = self.rule.task
+        true = true_gradients(task.network, states, x, labels, task.heads)
         activations = {}
-        for layer in EARLY:
-            _, x = layer_forward(layer, states[layer - 1], columns(layer, x))
+        for layer in self.early:
+            windows = columns(task.network, layer, x)
+            _, x = layer_forward(task.network, layer, states[layer - 1], windows)
             activations[layer] = x
         return activations, labels, true
 
     def _late_states(self, pixels: TaskSet) -> list[list[LayerState]]:
-        """Layers 4 to 6 of some tasks, before, during and after a run of these three."""
-        tasks = behind(self.start[: len(EARLY)], pixels)
-        late = self.start[len(EARLY) :]
+        """The late layers of some tasks, before, during and after a run of theirs."""
+        tasks = behind(self.rule.task.network, self.start[: len(self.early)], pixels)
+        late = self.start[len(self.early) :]
         moments = [start_states(late, len(tasks))]
         for epoch, states in enumerate(fine_tune(self.rule, late, tasks, self.config.epochs), 1):
             if epoch in self.config.looks:
@@ -122,19 +126,25 @@ class EarlyMatching:
 
 
 @torch.no_grad()
-def behind(layers: Sequence[tuple[Tensor, Tensor]], tasks: TaskSet, first: int = 1) -> TaskSet:
+def behind(
+    network: Network, layers: Sequence[tuple[Tensor, Tensor]], tasks: TaskSet, first: int = 1
+) -> TaskSet:
     """The same tasks seen from behind the first of their layers, numbered from `first`."""
     features = []
     for one in tasks.chunks(1):
         slices = one.features.split(SLICE, dim=1)
-        features.append(torch.cat([_forward(layers, x.float(), first) for x in slices], dim=1))
+        features.append(
+            torch.cat([_forward(network, layers, x.float(), first) for x in slices], dim=1)
+        )
     return TaskSet(torch.cat(features), tasks.labels, tasks.support)
 
 
-def _forward(layers: Sequence[tuple[Tensor, Tensor]], x: Tensor, first: int) -> Tensor:
+def _forward(
+    network: Network, layers: Sequence[tuple[Tensor, Tensor]], x: Tensor, first: int
+) -> Tensor:
     """Features (1, N, P, C) through a few layers, numbered from `first`."""
     for number, state in enumerate(start_states(layers, 1), first):
-        _, x = layer_forward(number, state, columns(number, x))
+        _, x = layer_forward(network, number, state, columns(network, number, x))
     return x
 
 

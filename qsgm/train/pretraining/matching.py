@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS, Loss
+from qsgm.schedule import MOMENTUM
+from qsgm.task import Task
 from qsgm.train.model.local import LayerState, local_step, true_gradients
+from qsgm.train.model.net import maps_of, positions_of
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
@@ -30,7 +32,7 @@ class MatchingConfig:
 
 @dataclass(frozen=True)
 class Examples:
-    """What an SGM is to learn: activation (M, C), label (M, 3) -> true gradient (M, C)."""
+    """What an SGM is to learn: activation (M, P, C), label (M, L) -> true gradient (M, P, C)."""
 
     activations: Tensor
     labels: Tensor
@@ -42,19 +44,19 @@ def record_examples(
     tasks: TaskSet,
     start: Sequence[tuple[Tensor, Tensor]],
     rates: Sequence[float],
-    loss: Loss,
+    task: Task,
     config: MatchingConfig,
     seed: int,
 ) -> dict[int, Examples]:
     """Run backpropagation on every task and keep what each SGM would have seen."""
-    layers = range(LAYERS + 1 - len(start), LAYERS)
+    layers = task.network.last(len(start))[:-1]
     seen: dict[int, list[tuple[Tensor, ...]]] = {layer: [] for layer in layers}
     for chunk in tasks.chunks(8):
         states = start_states(start, len(chunk))
         batches = shuffled_batches(chunk.support, config.epochs, seed)
         for number, rows in enumerate(batches):
             features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
-            states, activations, gradients = _backprop_step(states, features, labels, rates, loss)
+            states, activations, gradients = _backprop_step(states, features, labels, rates, task)
             if number % config.record_every == 0:
                 for layer in layers:
                     seen[layer].append((activations[layer], labels, gradients[layer]))
@@ -78,7 +80,8 @@ def fit_sgm(
     sgm.train()
     for _ in range(config.fit_steps):
         rows = torch.randint(len(examples.labels), (config.fit_batch,), generator=generator)
-        guess = sgm(examples.activations[rows, :, None, None], examples.labels[rows])[:, :, 0, 0]
+        maps = maps_of(examples.activations[rows], sgm.side)
+        guess = positions_of(sgm(maps, examples.labels[rows]))
         loss = ((guess - examples.gradients[rows]) / size).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -89,10 +92,11 @@ def fit_sgm(
 
 
 def _backprop_step(
-    states: list[LayerState], features: Tensor, labels: Tensor, rates: Sequence[float], loss: Loss
+    states: list[LayerState], features: Tensor, labels: Tensor, rates: Sequence[float], task: Task
 ) -> tuple[list[LayerState], dict[int, Tensor], dict[int, Tensor]]:
     """One step on true gradients; also every layer's activation and gradient."""
-    gradients = true_gradients(states, features, labels, loss)
+    network = task.network
+    gradients = true_gradients(network, states, features, labels, task.heads)
     activations: dict[int, Tensor] = {}
 
     def gradient_of(layer: int, activation: Tensor, _: Tensor) -> Tensor:
@@ -100,12 +104,12 @@ def _backprop_step(
         return gradients[layer]
 
     rate_tensors = [torch.tensor(rate) for rate in rates]
-    states = local_step(states, features, labels, rate_tensors, gradient_of, momentum=0.9)
+    states = local_step(network, states, features, labels, rate_tensors, gradient_of, MOMENTUM)
     return states, activations, gradients
 
 
 def _stack(parts: list[tuple[Tensor, ...]]) -> Examples:
     activations, labels, gradients = (
-        torch.cat([part[i].flatten(0, -2) for part in parts]) for i in range(3)
+        torch.cat([part[i].flatten(0, 1) for part in parts]) for i in range(3)
     )
     return Examples(activations, labels, gradients)

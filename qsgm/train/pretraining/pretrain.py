@@ -1,14 +1,13 @@
-"""`qsgm pretrain`: from nothing to `sgm.pt`, in six stages, resumable.
+"""Pretraining in its order: from drawn tasks to a checkpoint, resumable.
 
-1. backbone: GraspNet learns drawn objects by backpropagation.
-2. matching: the SGMs behind layers 4 and 5 regress true gradients.
-3. meta: MAML with these SGMs as the update rule, three layers tuned.
-4. early: the SGMs behind layers 1 to 3 regress true gradients.
-5. rates: where the device's decaying rates start, the best of a few on drawn objects of their own.
-6. decision: how the evidence for and against a candidate is weighed, on whole drawn scenes.
+1. backbone: the network learns drawn examples by backpropagation.
+2. matching: the SGMs behind the late layers but the last regress true gradients.
+3. meta: MAML with these SGMs as the update rule, the late layers tuned.
+4. early: the SGMs behind the layers in front of those regress true gradients.
+5. rates: where the device's decaying rates start, the best of a few on drawn lessons of their own.
 
-What is done so far is kept beside the output as `<output>.partial` and taken up again by the same
-version's same command: output, seed and device.
+A task may add a last stage of its own. What is done so far is kept beside the output as
+`<output>.partial` and taken up again by the same version's same command: output, seed and device.
 """
 
 import json
@@ -19,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import nn
@@ -28,17 +27,15 @@ import qsgm
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
-from qsgm.grasp.decision import Decision
+from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.grasp.decision import DecisionConfig, fit_decision
-from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
-from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.model.fold import folded_start, write_back
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start, write_back
 from qsgm.train.pretraining.backbone import BackboneConfig, BackboneTraining, in_memory_format
 from qsgm.train.pretraining.evaluate import Score, UpdateRule
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, OuterFigures
-from qsgm.train.pretraining.map_sgms import EarlyConfig, EarlyMatching
+from qsgm.train.pretraining.map_sgms import MapConfig, MapMatching
 from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
 from qsgm.train.pretraining.rates import (
     EARLY_RATE_GRID,
@@ -52,11 +49,8 @@ from qsgm.train.pretraining.rates import (
 )
 from qsgm.train.pretraining.resume import Partial
 from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
+from qsgm.train.task import DrawnTask
 
-TUNED = 3
-# Where meta-training's own rates start: layer 4 learns, the layers behind it hold still enough
-# for its SGM to know what they do.
-FIRST_RATES = (6e-3, 1e-3, 3e-3)
 SAVE_EVERY = 100
 
 # stage, steps done, steps in all, figures worth showing
@@ -68,58 +62,113 @@ class PretrainConfig:
     """Sizes of all stages; the defaults make the shipped checkpoint."""
 
     hidden: tuple[int, ...] = (64, 64)
+    # Of the late layers, which are meta-trained, where that starts: the first of them learns, those
+    # behind it hold still enough for its SGM to know what they do.
+    first_rates: tuple[float, ...] = (6e-3, 1e-3, 3e-3)
     tasks: int = 400
     crops_per_task: int = 400
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     maml: MamlConfig = field(default_factory=MamlConfig)
-    early: EarlyConfig = field(default_factory=EarlyConfig)
+    early: MapConfig = field(default_factory=MapConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
-    scenes: DecisionScenesConfig = field(default_factory=DecisionScenesConfig)
-    decision: DecisionConfig = field(default_factory=DecisionConfig)
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What the five stages come to."""
+
+    net: ConvNet
+    rule: UpdateRule  # its rates are those of the late layers
+    rates: dict[str, tuple[float, ...]]  # by blocks
+    short_gain: float
+    score: Score  # of the late layers, tuned
+
+
+class LastStage(Protocol):
+    """What a task learns when its network and SGMs are there."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Its sizes, for the card."""
+        ...
+
+    def __call__(self, learnt: Learnt, seed: int, watch: Watch) -> Described:
+        """The task with what was learnt."""
+        ...
 
 
 def pretrain(
+    task: DrawnTask,
     output: Path,
     seed: int,
     device: str,
     watch: Watch,
     config: PretrainConfig | None = None,
-    loss: Loss | None = None,
+    last_stage: LastStage | None = None,
+    arguments: str = "",
 ) -> Checkpoint:
     """Pretrain and write `output`.
 
     Args:
+        task: what the network is for, and where lessons come from.
         output: `sgm.pt`; its model card goes beside it, `sgm.md`. Folders on the way are made.
         seed: of everything drawn at random.
         device: `cpu` or `cuda`, for the backbone; the rest is small and stays on the CPU.
         watch: told about progress.
         config: sizes; the default makes the shipped checkpoint.
-        loss: and with it the angle encoding.
+        last_stage: of the task's own.
+        arguments: that the same command takes for the task, such as ` --encoding paper`.
 
     Raises:
         QsgmError: the device is not there, `output` cannot be written, or training diverged:
             weights are not finite, or fine-tuning fails at every rate. Then no `output` is written.
     """
-    config, loss = config or PretrainConfig(), loss or Loss()
+    config = config or PretrainConfig()
     _check_device(device)
     _check_output(output)
-    partial = Partial.open(output, _identity(seed, device, config, loss))
-    net = _backbone(partial, config, loss, seed, device, watch)
+    extra = {} if last_stage is None else last_stage.to_json()
+    partial = Partial.open(output, _identity(task, seed, device, config, extra))
+    net = _backbone(partial, config, task, seed, device, watch)
     with one_thread():
-        rule = _learn_to_tune(partial, net, config, loss, seed, watch)
-        early = _match_early(partial, net, rule, config, seed, watch)
-        rule = replace(rule, sgms={**early, **rule.sgms})
-        rates, gain, score = _choose_rates(net, rule, config, seed, watch)
-        rule = replace(rule, rates=rates[str(single_layers(TUNED))])
-        decision = _decide(net, rule, config, seed, watch)
-    command = _command(seed, device, config, loss)
-    card = _card(command, device, config, score, partial)
-    checkpoint = Checkpoint(net, rule.sgms, rule.curvatures, loss, rates, card, gain, decision)
+        learnt = _learn(partial, net, task, config, seed, watch)
+        done = task if last_stage is None else last_stage(learnt, seed, watch)
+    card = _card(
+        _command(seed, device, config) + arguments, device, config, extra, learnt.score, partial
+    )
+    rule = learnt.rule
+    checkpoint = Checkpoint(
+        task_record(done),
+        net,
+        rule.sgms,
+        rule.curvatures,
+        learnt.rates,
+        card,
+        learnt.short_gain,
+    )
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
     partial.remove()
     return checkpoint
+
+
+def _learn(
+    partial: Partial,
+    net: ConvNet,
+    task: DrawnTask,
+    config: PretrainConfig,
+    seed: int,
+    watch: Watch,
+) -> Learnt:
+    """Stages 2 to 5; `net` gets its new start."""
+    late = len(config.first_rates)
+    tasks = _draw(net, task, config.tasks, config.crops_per_task, seed + 1, watch, late)
+    sgms = _match(partial, net, tasks, config, task, seed, watch)
+    rule = _meta_train(partial, net, sgms, tasks, config, task, seed, watch)
+    early = _match_early(partial, net, rule, task, config, seed, watch)
+    rule = replace(rule, sgms={**early, **rule.sgms})
+    rates, gain, score = _choose_rates(net, rule, task, config, seed, watch)
+    rule = replace(rule, rates=rates[str(single_layers(task.network.last(late)))])
+    return Learnt(net, rule, rates, gain, score)
 
 
 @contextmanager
@@ -133,30 +182,23 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _identity(seed: int, device: str, config: PretrainConfig, loss: Loss) -> dict[str, Any]:
+def _identity(
+    task: DrawnTask, seed: int, device: str, config: PretrainConfig, extra: dict[str, Any]
+) -> dict[str, Any]:
     """What must be the same for an unfinished pretraining to be taken up."""
     return {
         "qsgm": qsgm.__version__,
         "seed": seed,
         "device": device,
-        "config": repr(config),
-        "loss": repr(loss),
+        "config": repr((config, extra)),
+        "task": repr(task),
     }
 
 
-def _learn_to_tune(
-    partial: Partial, net: GraspNet, config: PretrainConfig, loss: Loss, seed: int, watch: Watch
-) -> UpdateRule:
-    """Stages 2 and 3: what tunes the last three layers; `net` gets its new start."""
-    tasks = _draw(net, config.tasks, config.crops_per_task, seed + 1, loss, watch)
-    sgms = _match(partial, net, tasks, config, loss, seed, watch)
-    return _meta_train(partial, net, sgms, tasks, config, loss, seed, watch)
-
-
 def _backbone(
-    partial: Partial, config: PretrainConfig, loss: Loss, seed: int, device: str, watch: Watch
-) -> GraspNet:
-    training = BackboneTraining(config.backbone, loss, seed, device)
+    partial: Partial, config: PretrainConfig, task: DrawnTask, seed: int, device: str, watch: Watch
+) -> ConvNet:
+    training = BackboneTraining(config.backbone, task, seed, device)
     if "net" in partial.data:
         training.net.load_state_dict(partial.data["net"])
         return _portable(training.net)
@@ -178,19 +220,13 @@ def _backbone(
     return net
 
 
-def _portable(net: GraspNet) -> GraspNet:
+def _portable(net: ConvNet) -> ConvNet:
     """On the CPU, in the usual layout, in eval mode."""
     return in_memory_format(net.cpu(), torch.contiguous_format).eval()
 
 
 def _draw(
-    net: GraspNet,
-    count: int,
-    crops: int,
-    seed: int,
-    loss: Loss,
-    watch: Watch,
-    last_frozen: int = LAYERS - TUNED,
+    net: ConvNet, task: DrawnTask, count: int, samples: int, seed: int, watch: Watch, tuned: int
 ) -> TaskSet:
     done = 0
 
@@ -199,28 +235,29 @@ def _draw(
         done += 1
         watch("tasks", done, count, {})
 
-    return draw_tasks(net, count, crops, seed, loss, after_task, last_frozen)
+    return draw_tasks(net, task, count, samples, seed, after_task, task.network.depth - tuned)
 
 
 def _match(
     partial: Partial,
-    net: GraspNet,
+    net: ConvNet,
     tasks: TaskSet,
     config: PretrainConfig,
-    loss: Loss,
+    task: DrawnTask,
     seed: int,
     watch: Watch,
 ) -> dict[int, Sgm]:
     torch.manual_seed(seed + 3)
-    sgms = {layer: Sgm(layer, config.hidden) for layer in range(LAYERS + 1 - TUNED, LAYERS)}
+    layers = task.network.last(len(config.first_rates))
+    sgms = {layer: Sgm(task.network, layer, config.hidden) for layer in layers[:-1]}
     if "sgms" in partial.data:
         for layer, sgm in sgms.items():
             sgm.load_state_dict(partial.data["sgms"][layer])
         return {layer: sgm.eval() for layer, sgm in sgms.items()}
-    # Layers 5 and 6 hold still here: what layer 4's SGM regresses is then a function of its input.
-    rates = (FIRST_RATES[0], 0.0, 0.0)
-    start = folded_start(net, TUNED)
-    examples = record_examples(tasks, start, rates, loss, config.matching, seed)
+    # All but the first hold still here: what its SGM regresses is then a function of its input.
+    rates = (config.first_rates[0], *[0.0] * len(sgms))
+    start = folded_start(net, len(layers))
+    examples = record_examples(tasks, start, rates, task, config.matching, seed)
     done, total = 0, len(sgms) * config.matching.fit_steps
 
     def after_step() -> None:
@@ -237,16 +274,16 @@ def _match(
 
 def _meta_train(
     partial: Partial,
-    net: GraspNet,
+    net: ConvNet,
     sgms: dict[int, Sgm],
     tasks: TaskSet,
     config: PretrainConfig,
-    loss: Loss,
+    task: DrawnTask,
     seed: int,
     watch: Watch,
 ) -> UpdateRule:
-    start = folded_start(net, TUNED)
-    training = MetaTraining(config.maml, loss, tasks, start, sgms, FIRST_RATES, seed)
+    start, rates = folded_start(net, len(config.first_rates)), config.first_rates
+    training = MetaTraining(config.maml, task, tasks, start, sgms, rates, seed)
     if "meta" in partial.data:
         training.resume(partial.data["meta"])
     mean: dict[str, float] = {}
@@ -266,20 +303,23 @@ def _meta_train(
     write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
     _refuse_unless_finite("meta", net, *sgms.values())
     rates = tuple(float(rate) for rate in training.log_rates.detach().exp())
-    return UpdateRule(sgms, training.learnt_curvatures(), rates, loss)
+    return UpdateRule(sgms, training.learnt_curvatures(), rates, task)
 
 
 def _match_early(
     partial: Partial,
-    net: GraspNet,
+    net: ConvNet,
     rule: UpdateRule,
+    task: DrawnTask,
     config: PretrainConfig,
     seed: int,
     watch: Watch,
 ) -> dict[int, Sgm]:
-    early = config.early
-    pixels = _draw(net, early.tasks, early.crops_per_task, seed + 4, rule.loss, watch, 0)
-    training = EarlyMatching(early, rule, folded_start(net, LAYERS), pixels, seed + 5)
+    early, depth = config.early, task.network.depth
+    if len(rule.rates) == depth:
+        return {}
+    pixels = _draw(net, task, early.tasks, early.crops_per_task, seed + 4, watch, depth)
+    training = MapMatching(early, rule, folded_start(net, depth), pixels, seed + 5)
     if "early" in partial.data:
         for layer, sgm in training.sgms.items():
             sgm.load_state_dict(partial.data["early"][layer])
@@ -298,45 +338,35 @@ def _match_early(
 
 
 def _choose_rates(
-    net: GraspNet, rule: UpdateRule, config: PretrainConfig, seed: int, watch: Watch
+    net: ConvNet,
+    rule: UpdateRule,
+    task: DrawnTask,
+    config: PretrainConfig,
+    seed: int,
+    watch: Watch,
 ) -> tuple[dict[str, tuple[float, ...]], float, Score]:
-    """Rates for all numbers of layers and blocks, short runs' gain, and the score of three."""
-    sizes = config.rates
-    tasks = _draw(net, sizes.tasks, sizes.crops_per_task, seed + 2, rule.loss, watch)
+    """Rates for all numbers of layers and blocks, short runs' gain, and the late layers' score."""
+    sizes, network, late = config.rates, task.network, len(rule.rates)
+    tasks = _draw(net, task, sizes.tasks, sizes.crops_per_task, seed + 2, watch, late)
     done = 0
     total = len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
-    total += (LAYERS - TUNED) * len(EARLY_RATE_GRID)
+    total += (network.depth - late) * len(EARLY_RATE_GRID)
 
     def after_run(score: Score) -> None:
         nonlocal done
         done += 1
-        watch("rates", done, total, {"angle": score.angle_mae_deg})
+        watch("rates", done, total, {"objective": score.objective})
 
-    start = folded_start(net, TUNED)
+    start = folded_start(net, late)
     rates, score = choose_late(rule, start, tasks, sizes, after_run)
-    pixels = _draw(
-        net, sizes.early_tasks, sizes.early_crops_per_task, seed + 6, rule.loss, watch, 0
-    )
-    rule = replace(rule, rates=rates[TUNED])
+    rule = replace(rule, rates=rates[late])
     gain = choose_short_gain(rule, start, tasks, sizes, after_run)
-    rates |= choose_early(rule, folded_start(net, LAYERS), pixels, sizes, after_run)
-    singles = {str(single_layers(tuned)): of_layers for tuned, of_layers in rates.items()}
-    return singles | block_rates(rates[TUNED]), gain, score
-
-
-def _decide(
-    net: GraspNet, rule: UpdateRule, config: PretrainConfig, seed: int, watch: Watch
-) -> Decision:
-    done = 0
-
-    def after_episode() -> None:
-        nonlocal done
-        done += 1
-        watch("decision", done, config.scenes.episodes, {})
-
-    start = folded_start(net, TUNED)
-    judged = judged_scenes(net, rule, start, config.scenes, seed + 7, after_episode)
-    return fit_decision(judged, config.decision, seed)
+    if late < network.depth:
+        count, samples = sizes.early_tasks, sizes.early_crops_per_task
+        pixels = _draw(net, task, count, samples, seed + 6, watch, network.depth)
+        rates |= choose_early(rule, folded_start(net, network.depth), pixels, sizes, after_run)
+    singles = {str(single_layers(network.last(k))): of_layers for k, of_layers in rates.items()}
+    return singles | block_rates(network, rates[late]), gain, score
 
 
 def _check_device(device: str) -> None:
@@ -371,12 +401,11 @@ def _refuse_unless_finite(stage: str, *modules: nn.Module) -> None:
             )
 
 
-def _command(seed: int, device: str, config: PretrainConfig, loss: Loss) -> str:
+def _command(seed: int, device: str, config: PretrainConfig) -> str:
     """What to type for the same checkpoint; options at their defaults are left out."""
     hidden = ",".join(map(str, config.hidden))
     options = {
         "--device": (device, "cpu"),
-        "--encoding": (loss.encoding, Loss().encoding),
         "--hidden": (hidden, ",".join(map(str, PretrainConfig().hidden))),
     }
     said = [f" {name} {value}" for name, (value, usual) in options.items() if value != usual]
@@ -384,8 +413,14 @@ def _command(seed: int, device: str, config: PretrainConfig, loss: Loss) -> str:
 
 
 def _card(
-    command: str, device: str, config: PretrainConfig, score: Score, partial: Partial
+    command: str,
+    device: str,
+    config: PretrainConfig,
+    extra: dict[str, Any],
+    score: Score,
+    partial: Partial,
 ) -> dict[str, Any]:
+    figures = {"objective": score.objective, **score.scores}
     return {
         "command": command,
         "qsgm": qsgm.__version__,
@@ -394,8 +429,8 @@ def _card(
         "device": device,
         "seconds": round(partial.seconds),
         "resumed": partial.resumed,
-        "config": asdict(config),
-        "drawn_objects": {name: round(value, 4) for name, value in asdict(score).items()},
+        "config": asdict(config) | extra,
+        "drawn_objects": {name: round(value, 4) for name, value in figures.items()},
     }
 
 
@@ -404,13 +439,13 @@ def _card_text(output: Path, card: dict[str, Any]) -> str:
     resumed = ", interrupted and resumed" if card["resumed"] else ""
     return f"""# {output.name}
 
-GraspNet and the static SGMs behind its layers 1 to 5, batchnorm not yet folded. Made by
+A network and the static SGMs behind its layers but the last, batchnorm not yet folded. Made by
 
     {card["command"]}
 
 in {card["seconds"]} s{resumed} (backbone on {card["device"]}; {card["machine"]},
-torch {card["torch"]}, qsgm {card["qsgm"]}), on drawn objects alone: no photograph was seen. Objects
-drawn anew, tuned by these SGMs in float, three layers:
+torch {card["torch"]}, qsgm {card["qsgm"]}), on drawn lessons alone: no photograph was seen. Lessons
+drawn anew, the late layers tuned by these SGMs in float:
 
 {figures}
 

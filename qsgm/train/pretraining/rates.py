@@ -9,9 +9,8 @@ from itertools import product
 
 from torch import Tensor
 
-from qsgm.blocks import tuned_layers
+from qsgm.network import Network
 from qsgm.train.model.curvature import FLAT
-from qsgm.train.model.graspnet import LAYERS
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, best_rates, run_sgms
 from qsgm.train.pretraining.map_sgms import behind
 from qsgm.train.pretraining.tasks import TaskSet
@@ -23,7 +22,7 @@ META_RATE_FACTORS = (0.5, 0.7, 1.0)
 SHORT_GAINS = (1.0, 1.4, 2.0, 2.8)
 # Of the layer in front of those whose rates are known.
 EARLY_RATE_GRID = (1e-4, 1e-3, 1e-2)
-# Of layers 1 to 3 in one block with layer 4, whose true gradients are worth more.
+# Of layers in one block with the first meta-trained one, whose true gradients are worth more.
 BLOCK_RATE = 3e-3
 
 Rates = tuple[float, ...]
@@ -44,12 +43,15 @@ class RatesConfig:
     early_epochs: int = 15
 
 
-def block_rates(meta_rates: Rates) -> dict[str, Rates]:
-    """Rates of layers up to 4 as one block, by blocks; the meta-trained layers keep theirs."""
-    first, *rest = tuned_layers(len(meta_rates))
-    singles = ",".join(map(str, rest))
+def block_rates(network: Network, meta_rates: Rates) -> dict[str, Rates]:
+    """Rates by blocks: earlier layers as one block with the first meta-trained one.
+
+    The meta-trained layers keep theirs.
+    """
+    first, *rest = network.last(len(meta_rates))
+    singles = "".join(f",{number}" for number in rest)
     return {
-        f"{start}-{first},{singles}": (BLOCK_RATE,) * (first - start) + meta_rates
+        f"{start}-{first}{singles}": (BLOCK_RATE,) * (first - start) + meta_rates
         for start in range(first - 1, 0, -1)
     }
 
@@ -77,7 +79,8 @@ def choose_late(
     for rates in late_candidates(rule.rates):
         tuned = len(rates)
         skipped = len(start) - tuned
-        seen = behind(start[:skipped], tasks, LAYERS + 1 - len(start))
+        network = rule.task.network
+        seen = behind(network, start[:skipped], tasks, network.depth + 1 - len(start))
         # A layer alone has its gradient from the loss, and is trained as by backpropagation.
         trial = replace(rule, rates=rates, curvatures=rule.curvatures if tuned > 1 else FLAT)
         score = run_sgms(trial, start[skipped:], seen, config.epochs)
@@ -114,7 +117,7 @@ def choose_early(
     rates, chosen = rule.rates, {}
     while len(rates) < len(start):
         skipped = len(start) - len(rates) - 1
-        seen = behind(start[:skipped], pixels)
+        seen = behind(rule.task.network, start[:skipped], pixels)
         scores = {}
         for rate in EARLY_RATE_GRID:
             trial = (rate, *rates)

@@ -29,7 +29,7 @@ from qsgm.train.quantization.calibration_runs import (
     run,
     run_plans,
 )
-from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.train.quantization.lessons import Lessons, Watch
 
 # Not a calibrator: for each layer the best of them.
 AUTO = "auto"
@@ -55,7 +55,7 @@ class Calibration:
 
 def calibrate(
     trainee: Trainee,
-    frames: CalibrationSet,
+    lessons: Lessons,
     seed: int,
     watch: Watch,
     epochs: int = EPOCHS,
@@ -70,7 +70,7 @@ def calibrate(
 
     Args:
         trainee: what to fine-tune.
-        frames: the calibration set.
+        lessons: the calibration set.
         seed: of crops and batches.
         watch: told about progress.
         epochs: length of a whole run.
@@ -82,18 +82,21 @@ def calibrate(
         QsgmError: there is no such calibrator, a run diverged, or a frame cannot be used.
     """
     refuse_unknown(calibrator)
-    held_out = held_out_frames(len(frames)) if calibrator == AUTO else range(0)
-    everything, compared = observe(trainee, frames, seed, watch, epochs, held_out)
+    held_out = held_out_frames(len(lessons)) if calibrator == AUTO else range(0)
+    everything, compared = observe(trainee, lessons, seed, watch, epochs, held_out)
     levels = 2**activation_bits
     if calibrator == AUTO:
         candidates = quantize_all(trainee, compared, activation_bits)
-        judges = held_out or range(len(frames))
-        cosines = judge(trainee, candidates, frames, judges, seed, watch, epochs)
+        judges = held_out or range(len(lessons))
+        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs)
         chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
     else:
         cosines = {layer: {} for layer in trainee.sgms}
         chosen = dict.fromkeys(trainee.sgms, calibrator)
-    ranges = {layer: everything[layer].ranges(chosen[layer], levels) for layer in trainee.sgms}
+    ranges = {
+        layer: everything[layer].ranges(chosen[layer], levels, trainee.label_span)
+        for layer in trainee.sgms
+    }
     return Calibration(ranges, chosen, cosines, len(held_out))
 
 
@@ -112,7 +115,7 @@ def held_out_frames(count: int) -> range:
 
 def observe(
     trainee: Trainee,
-    frames: CalibrationSet,
+    lessons: Lessons,
     seed: int,
     watch: Watch,
     epochs: int,
@@ -122,22 +125,22 @@ def observe(
     everything, compared = (
         {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
     )
-    for i in range(len(frames)):
-        watch("calibrate", i, len(frames))
-        for layer, seen in observe_frame(trainee, frames[i], [seed, i], epochs).items():
+    for i in range(len(lessons)):
+        watch("calibrate", i, len(lessons))
+        for layer, seen in observe_lesson(trainee, lessons, i, seed, epochs).items():
             everything[layer].merge(seen)
             if i not in held_out:
                 compared[layer].merge(seen)
-    watch("calibrate", len(frames), len(frames))
+    watch("calibrate", len(lessons), len(lessons))
     return everything, compared
 
 
-def observe_frame(
-    trainee: Trainee, demonstration: Demonstration, seed: list[int], epochs: int
+def observe_lesson(
+    trainee: Trainee, lessons: Lessons, i: int, seed: int, epochs: int
 ) -> dict[int, SgmObservers]:
-    """What each SGM sees in the runs on one frame."""
+    """What each SGM sees in the runs on one lesson."""
     observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
-    for plan in run_plans(trainee.checkpoint.most_layers, epochs):
+    for plan in run_plans(trainee.network, trainee.checkpoint.most_layers, epochs):
 
         def gradient(layer: int, seen: FloatArray, plan: RunPlan = plan) -> FloatArray:
             result, hidden = trainee.float_trace(layer, seen)
@@ -145,7 +148,8 @@ def observe_frame(
                 observers[layer].update(seen, hidden)
             return result
 
-        for _ in run(trainee, demonstration, plan, seed, gradient):
+        lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
+        for _ in run(trainee, lesson, plan, [seed, i], gradient):
             pass
     return observers
 
@@ -157,7 +161,9 @@ def quantize_all(
     levels = 2**activation_bits
     return {
         layer: {
-            name: quantize_sgm(sgm, seen[layer].ranges(name, levels), activation_bits)
+            name: quantize_sgm(
+                sgm, seen[layer].ranges(name, levels, trainee.label_span), activation_bits
+            )
             for name in CALIBRATORS
         }
         for layer, sgm in trainee.sgms.items()
@@ -167,7 +173,7 @@ def quantize_all(
 def judge(
     trainee: Trainee,
     candidates: Candidates,
-    frames: CalibrationSet,
+    lessons: Lessons,
     judges: range,
     seed: int,
     watch: Watch,
@@ -183,7 +189,7 @@ def judge(
     for done, i in enumerate(judges):
         watch("choose", done, len(judges))
         for plan in measured_plans(trainee, epochs):
-            for layer, name, value in judge_run(trainee, candidates, frames[i], plan, [seed, i]):
+            for layer, name, value in judge_run(trainee, candidates, lessons, i, plan, seed):
                 cosines[layer][name].append(value)
     watch("choose", len(judges), len(judges))
     return {
@@ -195,16 +201,18 @@ def judge(
 def judge_run(
     trainee: Trainee,
     candidates: Candidates,
-    demonstration: Demonstration,
+    lessons: Lessons,
+    i: int,
     plan: RunPlan,
-    seed: list[int],
+    seed: int,
 ) -> Iterator[tuple[int, str, float]]:
     """Every now and then along one run, each calibrator's cosine at each SGM it is there for."""
 
     def driver(layer: int, seen: FloatArray) -> FloatArray:
         return trainee.float_trace(layer, seen)[0]
 
-    steps = run(trainee, demonstration, plan, seed, driver)
+    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
+    steps = run(trainee, lesson, plan, [seed, i], driver)
     for moment in islice(steps, 0, None, plan.measure_every):
         for layer, (seen, floating) in float_moment(trainee, moment).items():
             if layer in plan.measured:

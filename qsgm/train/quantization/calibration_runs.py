@@ -1,4 +1,4 @@
-"""Fine-tuning runs on calibration frames, as on the device, with SGMs that the caller runs.
+"""Fine-tuning runs on calibration lessons, as on the device, with SGMs that the caller runs.
 
 Activations move while layers train, so whoever wants to know what an SGM sees has to go along. Of a
 run only its current step is in memory.
@@ -11,26 +11,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qsgm.blocks import single_layers, tuned_layers
+from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
+from qsgm.network import ONE, Network, Pair
+from qsgm.schedule import BATCH, MOMENTUM, rate_factor
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_product, float_trace
+from qsgm.task import Lesson, label_span
 from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.model.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv
-from qsgm.train.model.graspnet import LAYERS
-from qsgm.train.model.local import LayerState, columns, layer_forward, local_step, loss_gradient
-from qsgm.train.pretraining.maml import MOMENTUM
-from qsgm.train.pretraining.tasks import Task, make_task, start_states
-from qsgm.train.quantization.calibration_set import Demonstration
-from qsgm.tune.loop import BATCH, rate_factor
+from qsgm.train.heads import error
+from qsgm.train.model.arrays import FoldedNet
+from qsgm.train.model.fold import fold_net, fold_sgm, run_folded_conv
+from qsgm.train.model.local import LayerState, columns, layer_forward, local_step
+from qsgm.train.model.net import maps_of, positions_of
+from qsgm.train.pretraining.tasks import SeenLesson, see_lesson, start_states
 from qsgm.weights import to_step_layout
 
 CROPS = 400
 EPOCHS = 40  # as many steps as 20 epochs on the 800 crops of the device
-# The most layers whose SGMs all see one position per crop. Those further ahead see whole maps, so
-# that a step takes about a hundred times as long: whole runs of them would take hours.
-ONE_POSITION = 3
-# A run of all layers is therefore a short one, its rates decaying as fast, on the same frames. The
-# activations of those layers move little, and every crop gives as many samples as its map is large.
+# Where SGMs see whole maps a step takes about a hundred times as long: whole runs would take hours.
+# A run of such layers is therefore a short one, its rates decaying as fast: their activations move
+# little, and every sample has as many positions as its map.
 MAP_CROPS = 96
 MAP_EPOCHS = 10
 # Steps between two measurements of fidelity; consecutive steps tell the same.
@@ -43,21 +43,13 @@ SgmGradient = Callable[[int, FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class RunPlan:
-    """A fine-tuning run: how many layers, on how many crops, for how many passes over them."""
+    """A fine-tuning run: how many layers, on how many samples, for how many passes over them."""
 
     tuned: int
     crops: int
     epochs: int
-
-    @property
-    def maps(self) -> bool:
-        """Whether there are SGMs in it that see whole maps; it is then there for those alone."""
-        return self.tuned > ONE_POSITION
-
-    @property
-    def measured(self) -> range:
-        """The layers of the SGMs that it is there for."""
-        return range(LAYERS + 1 - self.tuned, LAYERS + 1 - ONE_POSITION if self.maps else LAYERS)
+    measured: range  # the layers of the SGMs that it is there for
+    maps: bool = False  # whether there are SGMs in it that see maps; it is then there for those
 
     @property
     def measure_every(self) -> int:
@@ -73,13 +65,23 @@ class Trainee:
     net: FoldedNet
     sgms: Mapping[int, FoldedSgm]  # by layer
 
+    @property
+    def network(self) -> Network:
+        """The geometry of its network."""
+        return self.net.network
+
+    @property
+    def label_span(self) -> tuple[FloatArray, FloatArray]:
+        """Smallest and largest value of every label."""
+        return label_span(self.checkpoint.task.heads)
+
     def float_trace(self, layer: int, seen: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         """The SGM behind `layer` in float, as :func:`qsgm.sgm.float.float_trace`."""
         return float_trace(self.sgms[layer], seen, torch_product)
 
     def start(self, tuned: int) -> list[LayerState]:
         """The last `tuned` layers before the first step."""
-        layers = self.net.layers[LAYERS - tuned :]
+        layers = self.net.layers[-tuned:]
         return start_states(
             [
                 (torch.from_numpy(to_step_layout(layer.weight)).T, torch.from_numpy(layer.bias))
@@ -88,26 +90,20 @@ class Trainee:
             tasks=1,
         )
 
-    def task(self, demonstration: Demonstration, plan: RunPlan, seed: list[int]) -> Task:
-        """The crops of one frame, as the first of the tuned layers sees them."""
-        return make_task(
-            self.checkpoint.net,
-            demonstration.image,
-            np.random.default_rng(seed),
-            last_frozen=LAYERS - plan.tuned,
-            count=plan.crops,
-            loss=self.checkpoint.loss,
-            center_px=demonstration.center_px,
-        )
+    def seen(self, lesson: Lesson, tuned: int) -> SeenLesson:
+        """A lesson as the first of the tuned layers sees it."""
+        frozen = self.network.depth - tuned
+        return see_lesson(self.checkpoint.net, lesson, frozen, self.checkpoint.task)
 
 
-def torch_product(conv: FoldedConv, x: FloatArray) -> FloatArray:
+def torch_product(conv: FoldedConv, side: Pair, x: FloatArray) -> FloatArray:
     """:func:`qsgm.sgm.float.float_product` by torch, which takes maps five to ten times as fast."""
-    if conv.weight.shape[2] == 1:
-        return float_product(conv, x)
-    side = round(x.shape[1] ** 0.5)
-    maps = torch.from_numpy(x).transpose(1, 2).unflatten(2, (side, side))
-    return run_folded_conv(conv, maps).flatten(2).transpose(1, 2).contiguous().numpy()
+    if conv.weight.shape[2:] == ONE:
+        return float_product(conv, side, x)
+    maps: FloatArray = positions_of(
+        run_folded_conv(conv, maps_of(torch.from_numpy(x), side))
+    ).numpy()
+    return maps
 
 
 @dataclass(frozen=True)
@@ -116,7 +112,7 @@ class Moment:
 
     states: list[LayerState]
     features: Tensor  # (1, B, P, C)
-    labels: Tensor  # (1, B, 3)
+    labels: Tensor  # (1, B, L)
 
 
 def prepare(checkpoint: Checkpoint) -> Trainee:
@@ -125,35 +121,45 @@ def prepare(checkpoint: Checkpoint) -> Trainee:
     return Trainee(checkpoint, fold_net(checkpoint.net), sgms)
 
 
-def run_plans(most_layers: int, epochs: int) -> list[RunPlan]:
-    """Whole runs of two and of three layers, and a short one of all layers if there are more."""
-    whole = range(2, min(most_layers, ONE_POSITION) + 1)
-    plans = [RunPlan(tuned, CROPS, epochs) for tuned in whole]
-    if most_layers > ONE_POSITION:
-        plans.append(RunPlan(most_layers, MAP_CROPS, min(epochs, MAP_EPOCHS)))
+def one_position(network: Network) -> int:
+    """The most layers that can be tuned with SGMs that all see one position."""
+    flat = 1
+    while flat < network.depth and network.positions_after(network.depth - flat) == 1:
+        flat += 1
+    return flat
+
+
+def run_plans(network: Network, most_layers: int, epochs: int) -> list[RunPlan]:
+    """Whole runs of SGMs that see one position, and a short one of all layers if there are more."""
+    flat, depth = min(most_layers, one_position(network)), network.depth
+    plans = [
+        RunPlan(tuned, CROPS, epochs, range(depth + 1 - tuned, depth))
+        for tuned in range(2, flat + 1)
+    ]
+    if most_layers > flat:
+        measured = range(depth + 1 - most_layers, depth + 1 - flat)
+        plans.append(RunPlan(most_layers, MAP_CROPS, min(epochs, MAP_EPOCHS), measured, maps=True))
     return plans
 
 
 def measured_plans(trainee: Trainee, epochs: int) -> list[RunPlan]:
     """The runs that show all SGMs: those of two layers are part of those of three."""
     most = trainee.checkpoint.most_layers
-    return [plan for plan in run_plans(most, epochs) if plan.tuned >= min(most, ONE_POSITION)]
+    plans = run_plans(trainee.network, most, epochs)
+    return [plan for plan in plans if plan.tuned >= min(most, one_position(trainee.network))]
 
 
 def run(
-    trainee: Trainee,
-    demonstration: Demonstration,
-    plan: RunPlan,
-    seed: list[int],
-    sgm_gradient: SgmGradient,
+    trainee: Trainee, lesson: Lesson, plan: RunPlan, seed: list[int], sgm_gradient: SgmGradient
 ) -> Iterator[Moment]:
-    """Fine-tune the last layers on one frame as the device does; yields before every step.
+    """Fine-tune the last layers on a lesson as the device does; yields before every step.
 
     Raises QsgmError when the run diverges.
     """
-    task = trainee.task(demonstration, plan, seed)
+    task = trainee.seen(lesson, plan.tuned)
     states = trainee.start(plan.tuned)
-    rates = torch.tensor(trainee.checkpoint.rates[str(single_layers(plan.tuned))])
+    layers = trainee.network.last(plan.tuned)
+    rates = torch.tensor(trainee.checkpoint.rates[str(single_layers(layers))])
     done, steps = 0, plan.epochs * -(-len(task.labels) // BATCH)
     generator = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**31)))
     for _ in range(plan.epochs):
@@ -170,16 +176,17 @@ def step(
     trainee: Trainee, moment: Moment, rates: list[Tensor], sgm_gradient: SgmGradient
 ) -> list[LayerState]:
     """One feed-forward step."""
-    loss = trainee.checkpoint.loss
+    network, heads = trainee.network, trainee.checkpoint.task.heads
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
-        if layer == LAYERS:
-            return loss_gradient(loss, activation, labels[:, :, None])
+        if layer == network.depth:
+            return error(heads, activation, labels[:, :, None])
         filled = labels[0, :, None].expand(-1, activation.shape[2], -1)
         seen = torch.cat([activation[0], filled], dim=2).numpy()
         return torch.from_numpy(sgm_gradient(layer, seen))[None]
 
     return local_step(
+        network,
         moment.states,
         moment.features,
         moment.labels,
@@ -194,7 +201,7 @@ def refuse_unless_finite(states: list[LayerState]) -> None:
     """Raise QsgmError for a run that has blown up."""
     if not all(torch.isfinite(state.weight).all() for state in states):
         raise QsgmError(
-            f"fine-tuning {len(states)} layers on a calibration frame diverged: the checkpoint's"
+            f"fine-tuning {len(states)} layers on a calibration lesson diverged: the checkpoint's"
             " SGMs and rates do not work; pretrain again"
         )
 
@@ -213,11 +220,11 @@ def float_moment(trainee: Trainee, moment: Moment) -> dict[int, tuple[FloatArray
     return found
 
 
-def passes_of(moment: Moment) -> dict[int, tuple[Tensor, Tensor]]:
+def passes_of(network: Network, moment: Moment) -> dict[int, tuple[Tensor, Tensor]]:
     """By layer, the windows (1, B, P, K) it sees and its pre-activation (1, B, P, C)."""
     passes, x = {}, moment.features
-    for layer, state in zip(tuned_layers(len(moment.states)), moment.states, strict=True):
-        windows = columns(layer, x)
-        before, x = layer_forward(layer, state, windows)
+    for layer, state in zip(network.last(len(moment.states)), moment.states, strict=True):
+        windows = columns(network, layer, x)
+        before, x = layer_forward(network, layer, state, windows)
         passes[layer] = windows, before
     return passes

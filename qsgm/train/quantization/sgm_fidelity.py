@@ -3,10 +3,12 @@
 from collections.abc import Iterator, Mapping
 from itertools import islice
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from qsgm.fidelity import Gradients, LayerFidelity, compare, mean_over_run
+from qsgm.network import Network
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
 from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
@@ -20,13 +22,13 @@ from qsgm.train.quantization.calibration_runs import (
     passes_of,
     run,
 )
-from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.train.quantization.lessons import Lessons, Watch
 
 
 def measure(
     trainee: Trainee,
     int8_sgms: Mapping[int, QuantizedSgm],
-    frames: CalibrationSet,
+    lessons: Lessons,
     seed: int,
     watch: Watch,
     epochs: int = EPOCHS,
@@ -38,21 +40,22 @@ def measure(
     taken along the short runs of all layers, which the float SGMs drive: they are quicker here.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
-    for i in range(len(frames)):
-        watch("measure", i, len(frames))
+    for i in range(len(lessons)):
+        watch("measure", i, len(lessons))
         for plan in measured_plans(trainee, epochs):
-            for layer, fidelity in measure_run(trainee, int8_sgms, frames[i], plan, [seed, i]):
+            for layer, fidelity in measure_run(trainee, int8_sgms, lessons, i, plan, seed):
                 measured[layer].append(fidelity)
-    watch("measure", len(frames), len(frames))
+    watch("measure", len(lessons), len(lessons))
     return {layer: mean_over_run(values) for layer, values in measured.items()}
 
 
 def measure_run(
     trainee: Trainee,
     int8_sgms: Mapping[int, QuantizedSgm],
-    demonstration: Demonstration,
+    lessons: Lessons,
+    i: int,
     plan: RunPlan,
-    seed: list[int],
+    seed: int,
 ) -> Iterator[tuple[int, LayerFidelity]]:
     """Every now and then along one run, what the SGMs that it is there for are worth."""
 
@@ -61,7 +64,8 @@ def measure_run(
             return trainee.float_trace(layer, seen)[0]
         return integer_forward(int8_sgms[layer], seen)[0]
 
-    steps = run(trainee, demonstration, plan, seed, driver)
+    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
+    steps = run(trainee, lesson, plan, [seed, i], driver)
     for moment in islice(steps, 0, None, plan.measure_every):
         yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
 
@@ -70,13 +74,14 @@ def compare_moment(
     trainee: Trainee, int8_sgms: Mapping[int, QuantizedSgm], moment: Moment, layers: range
 ) -> dict[int, LayerFidelity]:
     """Int8, float and true gradients on one batch behind `layers`, as they are at that moment."""
-    true = true_gradients(moment.states, moment.features, moment.labels, trainee.checkpoint.loss)
-    fidelity, passes = {}, passes_of(moment)
+    network, heads = trainee.network, trainee.checkpoint.task.heads
+    true = true_gradients(network, moment.states, moment.features, moment.labels, heads)
+    fidelity, passes = {}, passes_of(network, moment)
     for layer, (seen, floating) in float_moment(trainee, moment).items():
         if layer in layers:
             int8, clipped = integer_forward(int8_sgms[layer], seen)
             given = (int8, floating, true[layer][0].numpy())
-            updates = (update_from(layer, *passes[layer], gradient) for gradient in given)
+            updates = (update_from(network, layer, *passes[layer], gradient) for gradient in given)
             fidelity[layer] = compare(
                 Gradients(*given),
                 Gradients(*updates),
@@ -86,7 +91,9 @@ def compare_moment(
     return fidelity
 
 
-def update_from(layer: int, windows: Tensor, before: Tensor, gradient: FloatArray) -> FloatArray:
+def update_from(
+    network: Network, layer: int, windows: Tensor, before: Tensor, gradient: FloatArray
+) -> FloatArray:
     """Gradients of a layer's weight and bias, one after the other, from one on its activation.
 
     Args:
@@ -95,6 +102,6 @@ def update_from(layer: int, windows: Tensor, before: Tensor, gradient: FloatArra
         before: its pre-activation, (1, B, P, C).
         gradient: (B, P', C), each sample's own.
     """
-    dz = through_activation(layer, before, torch.from_numpy(gradient)[None])
+    dz = through_activation(network, layer, before, torch.from_numpy(gradient)[None])
     parts = weight_gradients(windows, dz)
     return torch.cat([part.flatten() for part in parts]).numpy()

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.network import NONE, ONE, Network, area
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import BIAS_LIMIT, SMALLEST_SCALE, U8_MAX, live_span
-from qsgm.train.model.fold import PIXEL_OFFSET, PIXEL_SCALE, FoldedNet
+from qsgm.train.model.arrays import PIXEL_OFFSET, PIXEL_SCALE, FoldedNet
 
 S8_MAX = 127
 # An object on the device may excite a channel more than any of the calibration set did.
@@ -43,8 +44,7 @@ class QuantizedLayer:
     weight: NDArray[np.int8]  # (Co, Ci, kh, kw)
     scale: FloatArray  # (Co,)
     bias: NDArray[np.int32]  # (Co,)
-    stride: int
-    # (Co,), where a pool follows: its codes are those summed over it, times this, rounded.
+    # (Co,), where a pool follows: its codes are those summed over a window, times this, rounded.
     pool_gain: FloatArray | None
 
 
@@ -69,20 +69,31 @@ def quantize_trunk(net: FoldedNet, ranges: Mapping[int, LayerRange]) -> dict[int
         ranges: of layer 1 and those behind it, see
             :func:`qsgm.train.quantization.trunk_ranges.observe_trunk`.
     """
+    if not has_int8_trunk(net.network):
+        return {}
     # A channel's value is `step` times what its code has above `zero`.
     step, zero = np.full(net.layers[0].weight.shape[1], PIXEL_SCALE), -PIXEL_OFFSET / PIXEL_SCALE
     layers = {}
     for number, seen in sorted(ranges.items()):
-        folded = net.layers[number - 1]
+        folded, layer = net.layers[number - 1], net.network.layer(number)
         # The weights absorb the very steps that the graphs use, rounded to float32 as they are.
         out, pooled = (u8_steps(high).astype(np.float64) for high in (seen.convolved, seen.pooled))
         steps = step[:, None, None] / out[:, None, None, None]
         weight, scale, bias = round_rows(folded.weight * steps, folded.bias / out)
         shift = np.rint(zero * weight.sum(axis=(1, 2, 3), dtype=np.int32)).astype(np.int32)
-        gain = (out / pooled / folded.pool**2).astype(np.float32) if folded.pool > 1 else None
-        layers[number] = QuantizedLayer(weight, scale, bias - shift, folded.stride, gain)
+        gain = None if layer.pool == ONE else (out / pooled / area(layer.pool)).astype(np.float32)
+        layers[number] = QuantizedLayer(weight, scale, bias - shift, gain)
         step, zero = pooled, 0.0
     return layers
+
+
+def has_int8_trunk(network: Network) -> bool:
+    """Whether the frozen layers can run in integers.
+
+    Pixels are codes already, other inputs are not; and a first layer that is padded sees zeros
+    where pixels have no code for one.
+    """
+    return network.input_kind == "pixels" and network.layer(1).padding == NONE
 
 
 def round_rows(

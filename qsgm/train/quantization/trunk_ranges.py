@@ -8,27 +8,25 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch.nn import functional as F
 
-from qsgm.grasp import source
-from qsgm.train.model.fold import FoldedNet
-from qsgm.train.model.graspnet import normalize
-from qsgm.train.pretraining.tasks import shipped_things
-from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration, Watch
+from qsgm.task import Inputs
+from qsgm.train.model.arrays import FoldedNet
+from qsgm.train.model.fold import run_folded_layer
+from qsgm.train.model.net import as_seen
+from qsgm.train.quantization.lessons import Lessons, Watch
 from qsgm.train.quantization.trunk import LayerRange
 
-CROPS = 200  # of each frame
+SAMPLES = 200  # of each lesson
 
 
 def observe_trunk(
-    net: FoldedNet, frames: CalibrationSet, seed: int, watch: Watch
+    net: FoldedNet, lessons: Lessons, seed: int, watch: Watch
 ) -> dict[int, LayerRange]:
     """Ranges of every layer that can be frozen, 1 to 5, by number.
 
     Args:
         net: the untouched network, on pixels in [-1, 1].
-        frames: the calibration set.
+        lessons: the calibration set.
         seed: of the crops.
         watch: told about every frame.
 
@@ -36,29 +34,22 @@ def observe_trunk(
         QsgmError: a frame cannot be used.
     """
     total: dict[int, LayerRange] = {}
-    for i in range(len(frames)):
-        watch("features", i, len(frames))
-        crops = calibration_crops(frames[i], np.random.default_rng([seed, i]))
-        for number, seen in observe_crops(net, crops):
+    for i in range(len(lessons)):
+        watch("features", i, len(lessons))
+        samples = lessons.samples(i, np.random.default_rng([seed, i]), SAMPLES)
+        for number, seen in observe_samples(net, samples):
             total[number] = join(total[number], seen) if number in total else seen
-    watch("features", len(frames), len(frames))
+    watch("features", len(lessons), len(lessons))
     return total
 
 
-def calibration_crops(demonstration: Demonstration, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Crops (N, 128, 128, 3) of one frame, as the device cuts them."""
-    shown = source.Demonstration(demonstration.image, demonstration.center_px)
-    return source.crop_source([shown], shipped_things(), rng, CROPS).cut(np.arange(CROPS))
-
-
-def observe_crops(net: FoldedNet, crops: NDArray[np.uint8]) -> Iterator[tuple[int, LayerRange]]:
-    """Number and range of every layer but the last, in order, on crops (N, 128, 128, 3)."""
-    x = normalize(torch.from_numpy(crops))
-    for number, layer in enumerate(net.layers[:-1], 1):
-        weight, bias = torch.from_numpy(layer.weight), torch.from_numpy(layer.bias)
-        convolved = F.relu(F.conv2d(x, weight, bias, layer.stride))
-        x = F.avg_pool2d(convolved, layer.pool, stride=1)
-        yield number, LayerRange(*(maps.amax((0, 2, 3)).numpy() for maps in (convolved, x)))
+def observe_samples(net: FoldedNet, samples: Inputs) -> Iterator[tuple[int, LayerRange]]:
+    """Number and range of every layer with a ReLU but the last, on samples (N, H, W, C)."""
+    x = as_seen(net.network, torch.from_numpy(samples))
+    for number in range(1, net.network.depth):
+        convolved, x = run_folded_layer(net, number, x)
+        if net.network.layer(number).relu:
+            yield number, LayerRange(*(maps.amax((0, 2, 3)).numpy() for maps in (convolved, x)))
 
 
 def join(one: LayerRange, other: LayerRange) -> LayerRange:

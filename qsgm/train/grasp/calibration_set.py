@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -13,21 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.grasp.lesson import GraspLesson
+from qsgm.grasp.source import Demonstration, crop_source
+from qsgm.grasp.task import GraspTask
 from qsgm.images import read_demonstration
+from qsgm.train.grasp.task import frame_lesson, shipped_things
 
 MANIFEST = "manifest.json"
 FORMAT, VERSION = "qsgm-calibration", 1
-
-# Of whatever goes through a set: (what is going on, frames done, of how many)
-Watch = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Demonstration:
-    """A frame (H, W, 3) BGR and the object's centre (x, y) in it [px]."""
-
-    image: NDArray[np.uint8]
-    center_px: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -80,6 +72,31 @@ class CalibrationSet:
                 f" outside its frame of {width}x{height}; correct its center_px"
             )
         return Demonstration(image, entry.center_px)
+
+
+@dataclass(frozen=True)
+class CalibrationLessons:
+    """The frames of a calibration set as lessons."""
+
+    frames: CalibrationSet
+    task: GraspTask
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def sha256(self) -> str:
+        """Of the manifest, and so of every frame."""
+        return hashlib.sha256(self.frames.manifest_bytes).hexdigest()
+
+    def lesson(self, i: int, rng: np.random.Generator, count: int) -> GraspLesson:
+        """Crops of a frame, nothing put on them."""
+        shown = self.frames[i]
+        return frame_lesson(shown.frame, rng, count, self.task, shown.center_px)
+
+    def samples(self, i: int, rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
+        """Crops (N, 128, 128, 3) of a frame, as the device cuts them."""
+        return crop_source([self.frames[i]], shipped_things(), rng, count).cut(np.arange(count))
 
 
 def _entries(manifest: Any) -> list[_Entry]:

@@ -1,0 +1,201 @@
+"""Teach an object: frames of it in, a tuned object out.
+
+    frame = read_frame(Path("object.png"))
+    result = finetune(frame, load_bundle(Path("export")))
+    result.save(Path("mug"), name="mug")
+
+The stages stand alone: :func:`prepare_object` does what all methods share, :func:`tune_object` one
+run of one method on it.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from qsgm import __version__
+from qsgm.bundle import Bundle
+from qsgm.grasp.lesson import GraspLabels, GraspLesson, Orientation
+from qsgm.grasp.likeness import likeness_of
+from qsgm.grasp.others import Other, add_others
+from qsgm.grasp.report import run_json
+from qsgm.grasp.shown import Shown, shown
+from qsgm.grasp.source import Demonstration, crop_source
+from qsgm.grasp.task import distractors_of, task_of
+from qsgm.grasp.tuned import ObjectDescription, TunedObject, save_object
+from qsgm.grasp.verdict import Verdict, verdict_on
+from qsgm.tune.features import Progress
+from qsgm.tune.plan import Plan, resolve
+from qsgm.tune.prepare import Prepared, prepare
+from qsgm.tune.result import Result
+from qsgm.tune.run import Observer, train, tune
+from qsgm.tune.settings import Settings
+
+Frame = NDArray[np.uint8]
+# One frame with the object at its centre, or some that show it anywhere.
+Frames = Frame | Sequence[Frame | Demonstration]
+
+
+@dataclass(frozen=True)
+class PreparedObject(Prepared):
+    """A taught object, before any step."""
+
+    labelled: GraspLabels
+    shown: Shown
+    others_sha256: tuple[str, ...]  # of the things that it is to be told apart from
+
+    @property
+    def orientation(self) -> Orientation:
+        """How the demonstrations lie as the untouched network sees them."""
+        return self.labelled.orientation
+
+
+@dataclass(frozen=True)
+class FinetuneResult(Result):
+    """A tuned object and everything that was measured on the way."""
+
+    prepared: PreparedObject
+
+    def save(self, folder: Path, name: str) -> None:
+        """Write the tuned object for `qsgm predict`; it appears complete or not at all.
+
+        Args:
+            folder: absent, empty or an earlier tuned object.
+            name: what the object is called.
+
+        Raises:
+            QsgmError: the folder cannot be written, or holds something else.
+        """
+        report = run_json(self, name, folder)
+        save_object(folder, self._description(name), self.network(), report)
+
+    def tuned_object(self, name: str = "object") -> TunedObject:
+        """The tuned object without a detour over the disk."""
+        return TunedObject(self._description(name), self.network(), self.plan.settings.threads)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the object will be found and told apart."""
+        like = likeness_of(self.prepared.shown.patches[0])
+        strength = self.prepared.orientation.strength
+        return verdict_on(self.scores, self.untouched, strength, like, trained=self.plan.epochs > 0)
+
+    def _description(self, name: str) -> ObjectDescription:
+        prepared, task = self.prepared, task_of(self.prepared.bundle)
+        return ObjectDescription(
+            name,
+            task.encoding,
+            prepared.orientation.offset_rad,
+            prepared.shown.scale,
+            prepared.shown.views(prepared.orientation.of_each_rad),
+            task.decision,
+            self._made(),
+        )
+
+    def _made(self) -> dict[str, Any]:
+        """From what, by what: with the same of all this the same object comes out."""
+        return {
+            "qsgm": __version__,
+            "onnxruntime": ort.__version__,
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "bundle_sha256": self.prepared.bundle.sha256(),
+            "seed": self.prepared.plan.settings.seed,
+            "frames_sha256": list(self.prepared.shown.sha256),
+            "others_sha256": list(self.prepared.others_sha256),
+        }
+
+
+def finetune(
+    frames: Frames,
+    bundle: Bundle,
+    settings: Settings | None = None,
+    watch: Progress | None = None,
+    others: Sequence[Other] = (),
+    span_px: float | None = None,
+) -> FinetuneResult:
+    """Tune the bundle's network to an object.
+
+    Args:
+        frames: a demonstration frame (H, W, 3) BGR with the object at its centre, or several
+            frames or :class:`Demonstration` of the same object, of which the first says what
+            angle 0 is.
+        bundle: whose network is tuned.
+        settings: how.
+        watch: told about progress.
+        others: things to tell the object apart from.
+        span_px: the object's long side in the first frame; None: it is measured.
+
+    Raises:
+        QsgmError: the object's window leaves the frame, the bundle cannot do what the settings
+            ask for, or training diverged.
+    """
+    plan = resolve(settings or Settings(), bundle)
+    return tune_object(prepare_object(frames, bundle, plan, watch, others, span_px), plan, watch)
+
+
+def prepare_object(
+    frames: Frames,
+    bundle: Bundle,
+    plan: Plan,
+    watch: Progress | None = None,
+    others: Sequence[Other] = (),
+    span_px: float | None = None,
+) -> PreparedObject:
+    """Crops, features, labels and what the untouched network makes of them.
+
+    Arguments and errors as :func:`finetune` has them.
+    """
+    began = time.perf_counter()
+    demonstrations, task = as_demonstrations(frames), task_of(bundle)
+    seen = shown(demonstrations, span_px)
+    things = add_others(distractors_of(bundle), others, seen.scale)
+    rng = np.random.default_rng(plan.settings.seed)
+    crops = crop_source(seen.demonstrations, things, rng)
+    prepared = prepare(GraspLesson(crops, task.encoding, seen.turns_rad), bundle, plan, watch)
+    assert isinstance(prepared.labelled, GraspLabels)
+    seconds = prepared.seconds | {"total": time.perf_counter() - began}
+    sums = tuple(other.sha256 for other in others)
+    values = _values(prepared) | {"seconds": seconds}
+    return PreparedObject(**values, shown=seen, others_sha256=sums)
+
+
+def tune_object(
+    prepared: PreparedObject, plan: Plan, watch: Progress | None = None
+) -> FinetuneResult:
+    """One run with probes and warnings; see :func:`qsgm.tune.run.tune`."""
+    return FinetuneResult(**_values(tune(prepared, plan, watch)))
+
+
+def train_object(
+    prepared: PreparedObject, plan: Plan, observers: Sequence[Observer] = ()
+) -> FinetuneResult:
+    """The training alone; see :func:`qsgm.tune.run.train`."""
+    return FinetuneResult(**_values(train(prepared, plan, observers)))
+
+
+def as_demonstrations(frames: Frames) -> list[Demonstration]:
+    """Frames, each with where its object is: at its middle where it does not say."""
+    some = [frames] if isinstance(frames, np.ndarray) else list(frames)
+    if not some:
+        raise ValueError("`frames` must hold at least one frame")
+    found = []
+    for one in some:
+        frame = one.frame if isinstance(one, Demonstration) else one
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+        center = (frame.shape[1] / 2, frame.shape[0] / 2)
+        found.append(one if isinstance(one, Demonstration) else Demonstration(frame, center))
+    return found
+
+
+def _values(result: Prepared | Result) -> dict[str, Any]:
+    """Every field, to make more of it."""
+    return {one.name: getattr(result, one.name) for one in fields(result)}

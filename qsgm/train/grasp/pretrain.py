@@ -1,0 +1,57 @@
+"""`qsgm pretrain`: the grasping task from nothing to `sgm.pt`.
+
+The five stages of :mod:`qsgm.train.pretraining.pretrain`, and a sixth: how the evidence for and
+against a candidate is weighed, on whole drawn scenes.
+"""
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from qsgm.grasp.task import GraspTask
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.grasp.decision import DecisionConfig, fit_decision
+from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
+from qsgm.train.grasp.task import DrawnGrasping
+from qsgm.train.model.fold import folded_start
+from qsgm.train.pretraining.pretrain import Learnt, PretrainConfig, Watch, pretrain
+
+
+@dataclass(frozen=True)
+class DecisionStage:
+    """The sixth stage."""
+
+    task: GraspTask
+    scenes: DecisionScenesConfig = field(default_factory=DecisionScenesConfig)
+    decision: DecisionConfig = field(default_factory=DecisionConfig)
+
+    def to_json(self) -> dict[str, Any]:
+        return {"scenes": asdict(self.scenes), "decision": asdict(self.decision)}
+
+    def __call__(self, learnt: Learnt, seed: int, watch: Watch) -> GraspTask:
+        done = 0
+
+        def after_episode() -> None:
+            nonlocal done
+            done += 1
+            watch("decision", done, self.scenes.episodes, {})
+
+        start = folded_start(learnt.net, len(learnt.rule.rates))
+        judged = judged_scenes(learnt.net, learnt.rule, start, self.scenes, seed + 7, after_episode)
+        return replace(self.task, decision=fit_decision(judged, self.decision, seed))
+
+
+def pretrain_grasping(
+    task: DrawnGrasping,
+    output: Path,
+    seed: int,
+    device: str,
+    watch: Watch,
+    config: PretrainConfig | None = None,
+    last_stage: DecisionStage | None = None,
+) -> Checkpoint:
+    """Pretrain and write `output`; arguments and errors as :func:`pretrain` has them."""
+    stage = last_stage or DecisionStage(task)
+    usual = task.encoding == DrawnGrasping().encoding
+    arguments = "" if usual else f" --encoding {task.encoding}"
+    return pretrain(task, output, seed, device, watch, config, stage, arguments)

@@ -1,0 +1,30 @@
+"""What quantization asks of a calibration set."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from qsgm.task import Inputs, Lesson
+
+# Of whatever goes through a set: (what is going on, lessons done, of how many)
+Watch = Callable[[str, int, int], None]
+
+
+class Lessons(Protocol):
+    """Lessons to calibrate on, one at a time."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def sha256(self) -> str:
+        """Of everything in it."""
+        ...
+
+    def lesson(self, i: int, rng: np.random.Generator, count: int) -> Lesson:
+        """The i-th lesson with `count` samples, to be fine-tuned on."""
+        ...
+
+    def samples(self, i: int, rng: np.random.Generator, count: int) -> Inputs:
+        """Inputs (N, H, W, C) as the device makes them of the i-th lesson."""
+        ...
