@@ -1,10 +1,8 @@
 """What several tests share: a bundle with random weights, and frames with something on them."""
 
-import hashlib
 import json
 import shutil
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import cv2
@@ -15,25 +13,26 @@ from hypothesis import settings
 from numpy.typing import NDArray
 from torch import nn
 
-from qsgm import bundle as bundles
-from qsgm.blocks import one_block, parse_blocks, single_layers, tuned_layers
+from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.grasp.crops import cut_crops, plan_crops
+from qsgm.grasp.distractors import FILE as DISTRACTORS
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.images import write_png
+from qsgm.manifest import MANIFEST
 from qsgm.sgm.float import FoldedSgm, float_trace
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, quantize_sgm
-from qsgm.train.export import build_trunks, bundle_files
-from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
-from qsgm.train.graphs.probe import head_model, probe_model
-from qsgm.train.graphs.step import AnySgm, step_model
-from qsgm.train.graphs.trunk import initializer_offsets, network_model
+from qsgm.task import label_span, task_record
+from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.export import build_graphs, bundle_files, describe, exported_blocks
 from qsgm.train.grasp.draw_distractors import encode_sheet
-from qsgm.train.model.fold import FoldedNet, fold_net, fold_sgm
-from qsgm.train.model.graspnet import CHANNELS, GraspNet, Loss, normalize
+from qsgm.train.grasp.task import DrawnGrasping, shipped_things
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.quantization.calibration_set import Demonstration
-from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
-from qsgm.train.quantization.trunk_ranges import calibration_crops, observe_crops
+from qsgm.train.quantization.calibration_runs import prepare
+from qsgm.train.quantization.trunk import feature_steps, quantize_trunk
+from qsgm.train.quantization.trunk_ranges import observe_samples
 
 # Threads that wait for each other on a busy machine take longer than this work does.
 torch.set_num_threads(1)
@@ -42,11 +41,7 @@ settings.register_profile("qsgm", deadline=None, derandomize=True, database=None
 settings.load_profile("qsgm")
 
 MOST_LAYERS = 6
-BLOCKS = [single_layers(tuned) for tuned in range(1, MOST_LAYERS + 1)]
-BLOCKS += [parse_blocks(text) for text in ("4,5-6", "1-4,5,6")]
-WHOLE = [one_block(tuned) for tuned in range(1, MOST_LAYERS + 1)]
 RATES = (1e-4, 1e-4, 1e-3, 0.002, 0.005, 0.02)
-OPTIMIZERS: dict[bundles.OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
 
 
 @pytest.fixture(scope="session")
@@ -131,104 +126,61 @@ def draw_things() -> NDArray[np.uint8]:
 
 
 def write_bundle(folder: Path) -> None:
-    """Every graph a bundle holds, and the manifest."""
-    torch.manual_seed(0)
-    net, loss = fold_net(_random_net()), Loss()
-    net, int8_trunk = _quantized_trunk(net)
-    float_sgms = {layer: _random_sgm(layer) for layer in tuned_layers(MOST_LAYERS)[:-1]}
-    int8_sgms = {layer: _quantized(sgm) for layer, sgm in float_sgms.items()}
-    models = {bundles.NETWORK: network_model(net, loss.encoding)}
-    for tuned in range(1, MOST_LAYERS + 1):
-        models |= build_trunks(net, int8_trunk, tuned)
-        models[bundles.head_file(tuned)] = head_model(net, tuned, loss.encoding)
-        if tuned > 1:
-            probe = probe_model(net, tuned, float_sgms, int8_sgms, loss)
-            models[bundles.probe_file(tuned)] = probe
-    precisions: dict[bundles.Precision, dict[int, AnySgm]] = {
-        "float": dict(float_sgms),
-        "int8": dict(int8_sgms),
-    }
-    for precision, name, blocks in product(precisions, OPTIMIZERS, [*BLOCKS, *WHOLE]):
-        step = step_model(net, blocks, precisions[precision], loss, OPTIMIZERS[name])
-        models[bundles.step_file(precision, name, blocks)] = step
-    files, sgms = bundle_files(models, int8_sgms, float_sgms)
-    files[bundles.DISTRACTORS] = encode_sheet(draw_things())
+    """What the exporter makes of a random checkpoint; ranges are made up."""
+    trainee = prepare(random_checkpoint())
+    shown, rng = Demonstration(draw_frame()[0], (320, 240)), np.random.default_rng(1)
+    crops = crop_source([shown], shipped_things(), rng, 200).cut(np.arange(200))
+    ranges = dict(observe_samples(trainee.net, crops))
+    trainee = replace(trainee, net=replace(trainee.net, feature_steps=feature_steps(ranges)))
+    int8_sgms = {layer: _quantized(sgm) for layer, sgm in trainee.sgms.items()}
+    exported = exported_blocks(GRASPNET, MOST_LAYERS, ())
+    graphs = build_graphs(trainee, int8_sgms, quantize_trunk(trainee.net, ranges), exported)
+    files, sgms = bundle_files(graphs, int8_sgms, trainee.sgms)
+    files[DISTRACTORS] = encode_sheet(draw_things())
     for file, data in files.items():
         (folder / file).write_bytes(data)
-    manifest = _manifest(folder, net, loss) | {"sgms": sgms}
-    (folder / bundles.MANIFEST).write_text(json.dumps(manifest))
+    (folder / MANIFEST).write_text(describe(trainee, exported, files, sgms).text())
 
 
-def _manifest(folder: Path, net: FoldedNet, loss: Loss) -> dict[str, object]:
-    offsets = initializer_offsets((folder / bundles.NETWORK).read_bytes())
-    arrays = {f"weight{k}": layer.weight for k, layer in enumerate(net.layers, 1)}
-    arrays |= {f"bias{k}": layer.bias for k, layer in enumerate(net.layers, 1)}
-    both = [*BLOCKS, *WHOLE]
+def random_checkpoint() -> Checkpoint:
+    """Nothing in it was trained; rates are those at which nothing diverges."""
+    torch.manual_seed(0)
+    net = _random_net()
+    sgms = {layer: _random_sgm(layer) for layer in range(1, MOST_LAYERS)}
     rates = {
-        "sgd": {str(blocks): RATES[-len(blocks.layers) :] for blocks in both},
-        "adam": {str(blocks): [1e-3] * len(blocks.layers) for blocks in both},
+        str(single_layers(GRASPNET.last(tuned))): RATES[-tuned:]
+        for tuned in range(1, MOST_LAYERS + 1)
     }
-    return {
-        "format": bundles.FORMAT,
-        "version": bundles.VERSION,
-        "encoding": loss.encoding,
-        "label_smoothing": loss.label_smoothing,
-        "most_layers": MOST_LAYERS,
-        "trunk": "float",
-        "blocks": [str(blocks) for blocks in BLOCKS],
-        "recipes": {
-            "sgm": {
-                "optimizer": "sgd",
-                "rates": rates,
-                "short_gains": {str(blocks): 1.0 for blocks in BLOCKS},
-            },
-            "bp": {"optimizer": "adam", "rates": rates},
-        },
-        "initializers": {
-            name: {"shape": list(array.shape), "offset": offsets[name][0]}
-            for name, array in arrays.items()
-        },
-        "files": {
-            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-            for path in sorted(folder.iterdir())
-        },
-    }
+    return Checkpoint(task_record(DrawnGrasping()), net, sgms, {}, rates, {})
 
 
-def _random_net() -> GraspNet:
+def _random_net() -> ConvNet:
     """Random weights; batchnorm has seen crops, so that every layer's outputs vary."""
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     frame = draw_frame()[0]
     plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 64)
     with torch.no_grad():
         for _ in range(20):
-            net(normalize(torch.from_numpy(cut_crops(frame, plan))))
+            net(as_seen(GRASPNET, torch.from_numpy(cut_crops(frame, plan))))
     return net.eval()
 
 
-def _quantized_trunk(net: FoldedNet) -> tuple[FoldedNet, dict[int, QuantizedLayer]]:
-    """The network with steps for u8 features, and its frozen layers in int8."""
-    demonstration = Demonstration(draw_frame()[0], (320, 240))
-    crops = calibration_crops(demonstration, np.random.default_rng(1))
-    ranges = dict(observe_crops(net, crops))
-    return replace(net, feature_steps=feature_steps(ranges)), quantize_trunk(net, ranges)
-
-
-def _random_sgm(layer: int) -> FoldedSgm:
+def _random_sgm(layer: int) -> Sgm:
     """Gradients of about the size of true ones: untrained SGMs would run away."""
-    sgm = Sgm(layer, (12,))
+    sgm = Sgm(GRASPNET, layer, (12,))
     last = sgm.convs[-1]
     assert isinstance(last, nn.Conv2d)
     nn.init.normal_(last.weight, std=0.01)
     nn.init.zeros_(last.bias)
-    return fold_sgm(sgm.eval())
+    return sgm.eval()
 
 
 def _quantized(sgm: FoldedSgm) -> QuantizedSgm:
     """Ranges of activations up to 10, any label, and what the hidden layer makes of those."""
-    channels = CHANNELS[sgm.layer]
-    low = np.array([0.0] * channels + [0, -1, -1], np.float32)
-    high = np.array([10.0] * channels + [1, 1, 1], np.float32)
-    inputs = np.random.default_rng(0).uniform(low, high, (20, 25, len(low))).astype(np.float32)
+    channels, span = GRASPNET.layer(sgm.layer).out, label_span(DrawnGrasping().heads)
+    low = np.concatenate([np.zeros(channels, np.float32), span[0]])
+    high = np.concatenate([np.full(channels, 10, np.float32), span[1]])
+    shape = (20, GRASPNET.positions_after(sgm.layer), len(low))
+    inputs = np.random.default_rng(0).uniform(low, high, shape).astype(np.float32)
     _, (hidden,) = float_trace(sgm, inputs)
     return quantize_sgm(sgm, SgmRanges(low, high, (hidden.max(axis=(0, 1)) + 1,)))

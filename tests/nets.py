@@ -2,13 +2,14 @@
 
 import torch
 
-from qsgm.train.model.graspnet import GraspNet
+from qsgm.grasp.network import GRASPNET
+from qsgm.train.model.net import ConvNet
 
 
-def random_net(seed: int) -> GraspNet:
+def random_net(seed: int) -> ConvNet:
     """Random weights, and batchnorms that are far from the identity."""
     torch.manual_seed(seed)
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     for layer in net.layers:
         if layer.norm is not None:
             layer.norm.running_mean.normal_()
