@@ -15,16 +15,9 @@ from toys import by_correlation
 
 from qsgm import QsgmError, load_bundle
 from qsgm.blocks import one_block, parse_blocks, single_layers
-from qsgm.bundle import (
-    NETWORK,
-    Bundle,
-    Recipe,
-    head_file,
-    probe_file,
-    step_file,
-    trunk_file,
-)
-from qsgm.tune.run import finetune
+from qsgm.bundle import Bundle
+from qsgm.grasp.teach import finetune
+from qsgm.manifest import NETWORK, Recipe, head_file, probe_file, step_file, trunk_file
 from qsgm.tune.settings import Settings
 
 BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", "4,5-6", "1-4,5,6"]

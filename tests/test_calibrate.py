@@ -17,17 +17,20 @@ from qsgm import QsgmError
 from qsgm.blocks import single_layers
 from qsgm.cli.options import CalibratorName
 from qsgm.files import check_replaceable
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
 from qsgm.images import read_frame, write_png
 from qsgm.sgm.float import FloatArray, float_trace
 from qsgm.sgm.int8 import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
 from qsgm.sgm.ranges import CALIBRATORS, Observer, Span
 from qsgm.train import export_report
 from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.grasp.calibration_set import CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.draw_demo import draw_demo
 from qsgm.train.grasp.objects import TABLE_KINDS
 from qsgm.train.model.fold import fold_sgm, run_folded_sgm
-from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.quantization import calibration_runs
 from qsgm.train.quantization.calibrate import (
@@ -46,7 +49,6 @@ from qsgm.train.quantization.calibration_runs import (
     run_plans,
     torch_product,
 )
-from qsgm.train.quantization.calibration_set import CalibrationSet
 from qsgm.train.quantization.sgm_fidelity import measure
 
 RATES = {str(single_layers(tuned)): (1e-3,) * tuned for tuned in (1, 2, 3)}
@@ -70,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trainee() -> Trainee:
     torch.manual_seed(0)
     sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
-    return prepare(Checkpoint(GraspNet().eval(), sgms, {}, Loss(), RATES, {}))
+    return prepare(Checkpoint(ConvNet(GRASPNET).eval(), sgms, {}, GraspTask(), RATES, {}))
 
 
 def ignore(_stage: str, _done: int, _of: int) -> None:
@@ -320,7 +322,7 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
     for sgm in sgms.values():  # untrained as they are, keep them from running away
         torch.nn.init.normal_(sgm.convs[-1].weight, std=1e-4)
     rates = {str(single_layers(tuned)): (1e-4,) * tuned for tuned in range(1, 6)}
-    of_five = prepare(Checkpoint(GraspNet().eval(), sgms, {}, Loss(), rates, {}))
+    of_five = prepare(Checkpoint(ConvNet(GRASPNET).eval(), sgms, {}, GraspTask(), rates, {}))
     frames = CalibrationSet(folder)
     ranges = calibrate(of_five, frames, 0, ignore, EPOCHS, "minmax").ranges
     whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS, "minmax").ranges

@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from qsgm.errors import QsgmError
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
 from qsgm.train import checkpoint as module
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 
 
@@ -22,7 +24,9 @@ def checkpoint() -> Checkpoint:
     sgms = {4: Sgm(4, (8, 8)).eval(), 5: Sgm(5).eval()}
     rates = {"6": (0.03,), "5,6": (0.01, 0.03), "4,5,6": (0.005, 0.001, 0.003)}
     rates["4,5-6"] = (0.02, 0.001, 0.004)
-    return Checkpoint(GraspNet().eval(), sgms, {}, Loss(label_smoothing=0.1), rates, {"seed": 0})
+    return Checkpoint(
+        ConvNet(GRASPNET).eval(), sgms, {}, GraspTask(label_smoothing=0.1), rates, {"seed": 0}
+    )
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Checkpoint) -> None:
@@ -192,14 +196,14 @@ def test_sgms_and_rates_of_other_layers_do_not_go_together(layers: tuple[int, ..
     sgms = {layer: Sgm(layer) for layer in layers}
     rates = {text: tuple(values) for text, values in GOOD_RATES.items()}
     with pytest.raises(ValueError, match=r"SGMs stand behind|no rates for layers 3,4,5,6"):
-        Checkpoint(GraspNet(), sgms, {}, Loss(), rates, {})
+        Checkpoint(ConvNet(GRASPNET), sgms, {}, GraspTask(), rates, {})
 
 
 def test_the_number_of_layers_that_can_be_tuned_is_that_of_the_sgms_and_the_last(
     checkpoint: Checkpoint,
 ) -> None:
     assert checkpoint.most_layers == 3
-    assert Checkpoint(checkpoint.net, {}, {}, Loss(), {"6": (0.1,)}, {}).most_layers == 1
+    assert Checkpoint(checkpoint.net, {}, {}, GraspTask(), {"6": (0.1,)}, {}).most_layers == 1
 
 
 def test_a_small_file_that_unpacks_to_a_large_one_is_refused_unread(

@@ -16,9 +16,9 @@ import pytest
 from toys import by_correlation, lay, table, toy
 
 from qsgm import __version__, cli, paths
-from qsgm.bundle import NETWORK, trunk_file
 from qsgm.cli import commands, console
 from qsgm.errors import QsgmError
+from qsgm.manifest import NETWORK, trunk_file
 from qsgm.tune import run as finetuning
 from qsgm.tune.settings import Settings
 

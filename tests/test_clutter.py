@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qsgm.grasp import clutter
 from qsgm.grasp.clutter import Addition, plan_clutter
-from qsgm.grasp.crops import CROP_PX, cut_crops, plan_crops
+from qsgm.grasp.crops import cut_crops, plan_crops
 from qsgm.grasp.distractors import (
     TILE_PX,
     Distractors,
@@ -19,6 +19,7 @@ from qsgm.grasp.distractors import (
     paste_planned,
     with_named,
 )
+from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.train.grasp.draw_distractors import encode_sheet
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from qsgm.errors import QsgmError
 from qsgm.grasp.angles import angle_error, decode_angle
 from qsgm.grasp.crops import (
-    CROP_PX,
     HALF_CROP_PX,
     NEGATIVE_DISTANCE_PX,
     POSITIVE_JITTER_PX,
@@ -24,6 +23,7 @@ from qsgm.grasp.crops import (
     plan_crops,
     widened,
 )
+from qsgm.grasp.network import CROP_PX
 
 FRAME_HW = (480, 640)
 CENTER = (320.0, 240.0)

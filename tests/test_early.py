@@ -5,13 +5,14 @@ import torch
 from nets import random_net
 from torch.nn import functional as F
 
+from qsgm.grasp.task import GraspTask
 from qsgm.train.model.curvature import FLAT
-from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.fold import folded_start
 from qsgm.train.model.local import outputs
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.pretraining.evaluate import Score, UpdateRule
-from qsgm.train.pretraining.map_sgms import EarlyConfig, EarlyMatching, behind
+from qsgm.train.pretraining.map_sgms import MapConfig, MapMatching, behind
 from qsgm.train.pretraining.rates import (
     EARLY_RATE_GRID,
     SHORT_GAINS,
@@ -23,19 +24,19 @@ from qsgm.train.pretraining.rates import (
 )
 from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, start_states
 
-CONFIG = EarlyConfig(
+CONFIG = MapConfig(
     tasks=2, crops_per_task=20, epochs=2, looks=(1, 2), steps=40, tasks_per_step=2, crops_per_step=4
 )
-LOSS = Loss()
+LOSS = GraspTask()
 
 
 @pytest.fixture(scope="module")
-def net() -> GraspNet:
+def net() -> ConvNet:
     return random_net(1)
 
 
 @pytest.fixture(scope="module")
-def pixels(net: GraspNet) -> TaskSet:
+def pixels(net: ConvNet) -> TaskSet:
     return draw_tasks(net, 2, 20, 5, LOSS, lambda: None, last_frozen=0)
 
 
@@ -46,7 +47,7 @@ def rule() -> UpdateRule:
     return UpdateRule(sgms, FLAT, (1e-3, 1e-3, 1e-3), LOSS)
 
 
-def test_features_behind_layers_are_those_of_the_network(net: GraspNet, pixels: TaskSet) -> None:
+def test_features_behind_layers_are_those_of_the_network(net: ConvNet, pixels: TaskSet) -> None:
     seen = behind(folded_start(net, 6)[:3], pixels)
     whole = outputs(start_states(folded_start(net, 6), 2), pixels.features.float())
     rest = outputs(start_states(folded_start(net, 3), 2), seen.features)
@@ -54,9 +55,9 @@ def test_features_behind_layers_are_those_of_the_network(net: GraspNet, pixels: 
 
 
 def test_early_sgms_learn_what_true_gradients_have_in_common(
-    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+    net: ConvNet, pixels: TaskSet, rule: UpdateRule
 ) -> None:
-    training = EarlyMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
+    training = MapMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
     seen: list[float] = []
     sgms = training.run(lambda cosines: seen.append(cosines[3]))
     assert len(seen) == CONFIG.steps
@@ -70,9 +71,9 @@ def test_early_sgms_learn_what_true_gradients_have_in_common(
 
 
 def test_layers_are_looked_at_before_during_and_after_runs(
-    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+    net: ConvNet, pixels: TaskSet, rule: UpdateRule
 ) -> None:
-    training = EarlyMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
+    training = MapMatching(CONFIG, rule, folded_start(net, 6), pixels, seed=0)
     (moments,) = training.behind
     weights = [states[0].weight for states in moments]
     assert len(weights) == 3
@@ -82,7 +83,7 @@ def test_layers_are_looked_at_before_during_and_after_runs(
 
 
 def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_theirs(
-    net: GraspNet, pixels: TaskSet, rule: UpdateRule
+    net: ConvNet, pixels: TaskSet, rule: UpdateRule
 ) -> None:
     scores: list[Score] = []
     config = RatesConfig(epochs=1, early_epochs=1)

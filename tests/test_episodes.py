@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from qsgm.grasp.evidence import NAMES
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
 from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, best_score, fit_decision
 from qsgm.train.grasp.decision_scenes import heatmap_of
 from qsgm.train.grasp.episodes import USUAL, EpisodeMaker
-from qsgm.train.model.graspnet import GraspNet, Loss, normalize
-from qsgm.train.model.start import folded_start
+from qsgm.train.model.fold import folded_start
+from qsgm.train.model.net import ConvNet, normalize
 from qsgm.train.pretraining.tasks import start_states
 
 
@@ -68,7 +70,7 @@ def test_the_decision_finds_what_the_evidence_shows_and_raises_few_false_alarms(
 
 def test_a_heatmap_by_folded_layers_is_the_networks_own() -> None:
     torch.manual_seed(0)
-    net, loss = GraspNet().eval(), Loss()
+    net, loss = ConvNet(GRASPNET).eval(), GraspTask()
     frame = np.random.default_rng(0).integers(0, 255, (176, 160, 3)).astype(np.uint8)
     with torch.no_grad():
         expected = loss.activate(net(normalize(torch.from_numpy(frame[None]))))[0].numpy()

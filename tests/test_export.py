@@ -16,22 +16,26 @@ from toys import by_correlation
 
 from qsgm import QsgmError
 from qsgm.blocks import parse_blocks, single_layers
-from qsgm.bundle import NETWORK, Bundle, Recipe, load_bundle
+from qsgm.bundle import Bundle, load_bundle
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
 from qsgm.grasp.tuned import ObjectDescription, save_object
+from qsgm.manifest import NETWORK, Recipe
+from qsgm.schedule import BATCH
 from qsgm.train import export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.export import fold_and_quantize
 from qsgm.train.export_report import ExportReport
 from qsgm.train.graphs.inspection import refuse_float_products
+from qsgm.train.grasp.calibration_set import CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
+from qsgm.train.grasp.export import fold_and_quantize
 from qsgm.train.liveness import step_memory
 from qsgm.train.model.fold import fold_net
-from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.quantization import calibration_runs
-from qsgm.train.quantization.calibration_set import CalibrationSet
-from qsgm.tune.loop import BATCH, StepLoop
+from qsgm.tune.loop import StepLoop
 from qsgm.weights import to_step_layout
 
 RATES = {"6": (4e-3,), "5,6": (2e-3, 3e-3), "4,5,6": (1e-3, 2e-3, 3e-3)}
@@ -74,9 +78,9 @@ class Workplace:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         torch.manual_seed(0)
-        self.net = GraspNet().eval()
+        self.net = ConvNet(GRASPNET).eval()
         sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
-        self.checkpoint = Checkpoint(self.net, sgms, {}, Loss(), RATES, {"seed": 11})
+        self.checkpoint = Checkpoint(self.net, sgms, {}, GraspTask(), RATES, {"seed": 11})
         save_checkpoint(folder / "sgm.pt", self.checkpoint)
         draw_calibration_set(folder / "calib", count=2, seed=5)
 

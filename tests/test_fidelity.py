@@ -18,7 +18,7 @@ from rich.console import Console
 from torch.nn import functional as F
 
 from qsgm import QsgmError, defaults
-from qsgm.bundle import MANIFEST, Bundle, load_bundle, probe_file
+from qsgm.bundle import Bundle, load_bundle
 from qsgm.fidelity import (
     PROBED,
     Gradients,
@@ -32,13 +32,15 @@ from qsgm.fidelity import (
     sqnr_db,
     weighted_error,
 )
+from qsgm.grasp.teach import FinetuneResult, finetune
+from qsgm.manifest import MANIFEST, probe_file
+from qsgm.schedule import BATCH
 from qsgm.train.model.local import LayerState, columns, layer_forward
 from qsgm.train.quantization.sgm_fidelity import update_from
 from qsgm.tune import probe as probing
-from qsgm.tune.loop import BATCH
 from qsgm.tune.prepare import STEPS_PER_EPOCH, prepare
 from qsgm.tune.report import fidelity_command_json, fidelity_command_report
-from qsgm.tune.run import FinetuneResult, finetune, train
+from qsgm.tune.run import train
 from qsgm.tune.settings import Settings
 
 RNG = np.random.default_rng(0)

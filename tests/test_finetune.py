@@ -15,20 +15,25 @@ from toys import bump, by_correlation, lay, table, toy
 
 from qsgm import QsgmError, finetune, load_bundle, load_object
 from qsgm.blocks import parse_blocks, single_layers
-from qsgm.bundle import Bundle, Precision, head_file
+from qsgm.bundle import Bundle
 from qsgm.grasp.angles import encode_angle
 from qsgm.grasp.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
 from qsgm.grasp.others import other_in
+from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
+from qsgm.grasp.teach import FinetuneResult
 from qsgm.grasp.tuned import MARGIN_PX
+from qsgm.manifest import Precision, head_file
+from qsgm.schedule import BATCH
 from qsgm.sgm.int8 import SgmRanges, constants, quantize_sgm
+from qsgm.tables import to_json
 from qsgm.tune import prepare as preparing
 from qsgm.tune import probe as probing
 from qsgm.tune import run as finetuning
-from qsgm.tune.loop import BATCH
-from qsgm.tune.prepare import SLICE, Accuracy, StreamedFeatures, accuracy_of, prepare
-from qsgm.tune.report import finetune_json, to_json
-from qsgm.tune.run import FinetuneResult, peak_activation_bytes, train
+from qsgm.tune.features import SLICE, StreamedFeatures
+from qsgm.tune.plan import peak_activation_bytes
+from qsgm.tune.prepare import Accuracy, accuracy_of, prepare
+from qsgm.tune.run import train
 from qsgm.tune.settings import Settings
 from qsgm.weights import to_step_layout
 

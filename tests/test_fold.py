@@ -3,19 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from qsgm.train.model.graspnet import CHANNELS
 from torch import nn
 from torch.nn import functional as F
 
 from qsgm import QsgmError
-from qsgm.train.model.fold import (
-    fold_net,
-    fold_sgm,
-    net_fold_error,
-    on_pixels,
-    run_folded,
-    sgm_fold_error,
-)
-from qsgm.train.model.graspnet import CHANNELS, GraspNet, normalize
+from qsgm.grasp.network import GRASPNET
+from qsgm.train.model.arrays import on_pixels
+from qsgm.train.model.fold import fold_net, fold_sgm, net_fold_error, run_folded, sgm_fold_error
+from qsgm.train.model.net import ConvNet, normalize
 from qsgm.train.model.sgm import Sgm
 
 
@@ -32,9 +28,9 @@ def shake_norms(module: nn.Module, seed: int) -> None:
     module.eval()
 
 
-def shaken_net(seed: int) -> GraspNet:
+def shaken_net(seed: int) -> ConvNet:
     torch.manual_seed(seed)
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     shake_norms(net, seed)
     return net
 
@@ -95,12 +91,12 @@ def test_batchnorm_is_folded_with_its_running_statistics_even_in_training_mode()
 
 
 def test_parameter_counts_are_the_papers() -> None:
-    layers = [sum(p.numel() for p in layer.parameters()) for layer in GraspNet().layers]
+    layers = [sum(p.numel() for p in layer.parameters()) for layer in ConvNet(GRASPNET).layers]
     assert layers == [624, 1624, 3248, 6448, 304, 51]
 
 
 def test_folded_layers_keep_geometry_and_drop_two_numbers_per_channel() -> None:
-    folded = fold_net(GraspNet())
+    folded = fold_net(ConvNet(GRASPNET))
     assert [layer.stride for layer in folded.layers] == [2, 2, 2, 2, 1, 1]
     assert [layer.relu for layer in folded.layers] == [True] * 5 + [False]
     assert [layer.pool for layer in folded.layers] == [1, 1, 1, 5, 1, 1]
@@ -111,21 +107,21 @@ def test_folded_layers_keep_geometry_and_drop_two_numbers_per_channel() -> None:
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_variance_that_is_not_finite_and_positive_is_refused(bad: float) -> None:
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     net.layers[2].norm.running_var[3] = bad
     with pytest.raises(QsgmError, match="layer 3: batchnorm's running statistics"):
         fold_net(net)
 
 
 def test_weights_that_are_not_finite_are_refused() -> None:
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     net.layers[5].conv.weight.data[0, 0] = float("nan")
     with pytest.raises(QsgmError, match="layer 6 has weights that are not finite"):
         fold_net(net)
 
 
 def test_a_batchnorm_that_no_convolution_can_absorb_is_refused() -> None:
-    net = GraspNet()
+    net = ConvNet(GRASPNET)
     net.add_module("stray", nn.BatchNorm2d(3))
     with pytest.raises(QsgmError, match="'stray' does not stand behind a convolution"):
         fold_net(net)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import Loss
-from qsgm.train.model.local import LayerState, local_step, loss_gradient, outputs, true_gradients
+from qsgm.grasp.task import GraspTask
+from qsgm.train.model.local import LayerState, error, local_step, outputs, true_gradients
 
 TASKS, BATCH = 3, 5
 SHAPES = {
@@ -23,7 +23,7 @@ SHAPES = {
 }
 SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees of a crop
 RATES = {1: 0.01, 2: 0.02, 3: 0.03, 4: 0.1, 5: 0.2, 6: 0.3}
-LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=2.0)]
+LOSSES = [GraspTask(), GraspTask("paper", label_smoothing=0.0, angle_weight=2.0)]
 
 DTYPE = torch.float64
 ROUNDING = 1e-12  # of the largest entry
@@ -100,11 +100,11 @@ def flat_gradients(number: int, weights: Weights, objective: Tensor) -> tuple[Te
 def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> None:
     tasks, (features, labels) = random_weights(tuned), random_data(tuned)
     states = as_states(tasks)
-    loss = Loss()
+    loss = GraspTask()
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
-            return loss_gradient(loss, activation, labels[:, :, None])
+            return error(loss, activation, labels[:, :, None])
         return made_up_gradient(layer, activation, labels)
 
     rates = [torch.tensor(RATES[number], dtype=DTYPE) for number in tasks[0]]
@@ -157,7 +157,7 @@ def test_loss_gradient_equals_autograd(loss: Loss) -> None:
     raw = (3 * normal(50, 3)).requires_grad_()
     labels = torch.rand(50, 3, dtype=DTYPE).round()
     (expected,) = torch.autograd.grad(loss.per_sample(raw, labels).sum(), raw)
-    assert_equal(loss_gradient(loss, raw.detach(), labels), expected)
+    assert_equal(error(loss, raw.detach(), labels), expected)
 
 
 @pytest.mark.parametrize("tuned", range(1, 7))
@@ -184,12 +184,12 @@ def test_meta_gradients_flow_through_a_step() -> None:
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
-            return loss_gradient(Loss(), activation, labels[:, :, None])
+            return error(GraspTask(), activation, labels[:, :, None])
         return scale[0] * made_up_gradient(layer, activation, labels)
 
     rates = [scale[1] * 0.1, torch.tensor(0.1, dtype=DTYPE)]
     updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
     raw = outputs(updated, features)
-    Loss()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
+    GraspTask()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
     assert scale.grad is not None
     assert (scale.grad != 0).all()

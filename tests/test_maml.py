@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qsgm.train.model.graspnet import Loss
+from qsgm.grasp.task import GraspTask
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, Run, _Unrolled, apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet
@@ -40,7 +40,7 @@ def tiny_training(
         (torch.randn(16, 3) * 0.3, torch.zeros(3)),
     ]
     sgms = {layer: Sgm(layer, (8,)) for layer in (4, 5)}
-    return MetaTraining(config, Loss(), tiny_tasks(), start, sgms, rates, seed)
+    return MetaTraining(config, GraspTask(), tiny_tasks(), start, sgms, rates, seed)
 
 
 # With SGMs that nobody trained, runs at the usual rates blow up or do not, as the seed has it.

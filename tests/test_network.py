@@ -9,15 +9,18 @@ from nets import random_net
 
 from qsgm import QsgmError
 from qsgm.grasp.angles import AngleEncoding
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
-from qsgm.train.model.fold import FoldedNet, fold_net
-from qsgm.train.model.graspnet import GraspNet, Loss, normalize
+from qsgm.train.model.arrays import FoldedNet
+from qsgm.train.model.fold import fold_net
+from qsgm.train.model.net import ConvNet, normalize
 from qsgm.weights import to_conv_layout, to_step_layout
 
 
 @pytest.fixture(scope="module")
-def net() -> GraspNet:
+def net() -> ConvNet:
     return random_net(0)
 
 
@@ -45,7 +48,7 @@ def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray
     ("last_frozen", "positions", "channels"),
     [(1, 3844, 8), (2, 841, 8), (3, 169, 16), (4, 1, 16), (5, 1, 16)],
 )
-def test_trunk_equals_torch(net: GraspNet, last_frozen: int, positions: int, channels: int) -> None:
+def test_trunk_equals_torch(net: ConvNet, last_frozen: int, positions: int, channels: int) -> None:
     crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
     got = run(trunk_model(fold_net(net), last_frozen).SerializeToString(), crops=crops)
     with torch.no_grad():
@@ -57,17 +60,17 @@ def test_trunk_equals_torch(net: GraspNet, last_frozen: int, positions: int, cha
 
 @pytest.mark.parametrize("encoding", ["double", "paper"])
 def test_network_on_a_frame_equals_torch(
-    net: GraspNet, frame: np.ndarray, encoding: AngleEncoding
+    net: ConvNet, frame: np.ndarray, encoding: AngleEncoding
 ) -> None:
     got = run(network_model(fold_net(net), encoding).SerializeToString(), frame=frame)
     with torch.no_grad():
         raw = net(normalize(torch.tensor(frame)[None]))
     assert got.shape == (3, 23, 33)
-    expected = Loss(encoding).activate(raw)[0].numpy()
+    expected = GraspTask(encoding).activate(raw)[0].numpy()
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_where_nothing_is_frozen_the_trunk_leaves_pixels_as_they_are(net: GraspNet) -> None:
+def test_where_nothing_is_frozen_the_trunk_leaves_pixels_as_they_are(net: ConvNet) -> None:
     crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
     got = run(trunk_model(fold_net(net), 0).SerializeToString(), crops=crops)
     assert got.dtype == np.uint8
@@ -76,7 +79,7 @@ def test_where_nothing_is_frozen_the_trunk_leaves_pixels_as_they_are(net: GraspN
 
 @pytest.mark.parametrize("tuned", range(1, 7))
 def test_every_cell_equals_trunk_and_head_on_its_window(
-    net: GraspNet, frame: np.ndarray, tuned: int
+    net: ConvNet, frame: np.ndarray, tuned: int
 ) -> None:
     folded = fold_net(net)
     heatmap = run(network_model(folded, "double").SerializeToString(), frame=frame)
@@ -88,18 +91,18 @@ def test_every_cell_equals_trunk_and_head_on_its_window(
     np.testing.assert_allclose(got, heatmap[:, rows, cols].T, rtol=1e-5, atol=1e-5)
 
 
-def test_network_takes_frames_of_other_sizes(net: GraspNet) -> None:
+def test_network_takes_frames_of_other_sizes(net: ConvNet) -> None:
     model = network_model(fold_net(net), "double").SerializeToString()
     assert run(model, frame=np.zeros((128, 128, 3), np.uint8)).shape == (3, 1, 1)
     assert run(model, frame=np.zeros((144, 200, 3), np.uint8)).shape == (3, 2, 5)
 
 
 def test_patching_bytes_in_the_file_makes_the_tuned_network(
-    net: GraspNet, frame: np.ndarray
+    net: ConvNet, frame: np.ndarray
 ) -> None:
     data = network_model(fold_net(net), "double").SerializeToString()
     torch.manual_seed(1)
-    tuned = GraspNet().eval()
+    tuned = ConvNet(GRASPNET).eval()
     for number in (1, 2, 3):
         tuned.layers[number - 1] = net.layers[number - 1]
     patched = bytearray(data)
@@ -117,7 +120,7 @@ def test_patching_bytes_in_the_file_makes_the_tuned_network(
     np.testing.assert_array_equal(run(bytes(patched), frame=frame), heatmap)
 
 
-def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: GraspNet) -> None:
+def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: ConvNet) -> None:
     folded = fold_net(net)
     for layer in folded.layers[3:5]:
         layer.bias[:] = 0
@@ -131,7 +134,7 @@ def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: G
 
 
 @pytest.mark.parametrize("layer", range(1, 7))
-def test_weights_survive_the_way_into_the_steps_layout_and_back(net: GraspNet, layer: int) -> None:
+def test_weights_survive_the_way_into_the_steps_layout_and_back(net: ConvNet, layer: int) -> None:
     weight = fold_net(net).layers[layer - 1].weight
     windows = to_step_layout(weight)
     out, into, kernel, _ = weight.shape
@@ -140,7 +143,7 @@ def test_weights_survive_the_way_into_the_steps_layout_and_back(net: GraspNet, l
     np.testing.assert_array_equal(to_conv_layout(windows, kernel), weight)
 
 
-def test_initializers_outside_raw_data_are_refused(net: GraspNet) -> None:
+def test_initializers_outside_raw_data_are_refused(net: ConvNet) -> None:
     model = network_model(fold_net(net), "double")
     tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "bias6")
     tensor.ClearField("raw_data")

@@ -16,7 +16,9 @@ from qsgm.errors import QsgmError
 from qsgm.grasp.angles import AngleEncoding, angle_error, encode_angle
 from qsgm.grasp.heatmap import Detection, locate, refine
 from qsgm.grasp.pictures import _values
-from qsgm.tune.report import detection_table, fidelity_table, plain_table, predict_json
+from qsgm.grasp.report import detection_table, predict_json
+from qsgm.tables import plain_table
+from qsgm.tune.report import fidelity_table
 
 FRAME_HW = (480, 640)
 ROWS_COLS = (23, 33)

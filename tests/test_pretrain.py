@@ -9,17 +9,17 @@ import torch
 
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
+from qsgm.grasp.task import GraspTask
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.grasp.decision import DecisionConfig
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig
-from qsgm.train.model.graspnet import Loss
 from qsgm.train.pretraining import pretrain as module
 from qsgm.train.pretraining import rates as rates_module
 from qsgm.train.pretraining import resume as partial_module
 from qsgm.train.pretraining.backbone import BackboneConfig
 from qsgm.train.pretraining.evaluate import Score
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining
-from qsgm.train.pretraining.map_sgms import EarlyConfig
+from qsgm.train.pretraining.map_sgms import MapConfig
 from qsgm.train.pretraining.matching import MatchingConfig
 from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
 from qsgm.train.pretraining.rates import RatesConfig
@@ -32,7 +32,7 @@ TINY = PretrainConfig(
     backbone=BackboneConfig(steps=4, frames_per_batch=2, crops_per_frame=8, loader_processes=0),
     matching=MatchingConfig(epochs=1, record_every=1, fit_steps=4, fit_batch=16),
     maml=MamlConfig(outer_steps=2, tasks_per_step=2, unroll=2, warm_up=1),
-    early=EarlyConfig(
+    early=MapConfig(
         tasks=2,
         crops_per_task=20,
         epochs=1,
@@ -192,9 +192,9 @@ def test_seconds_are_counted_over_interruptions(
 
 
 def test_the_command_on_the_card_says_every_option_that_is_not_the_default() -> None:
-    plain = module._command(0, "cpu", PretrainConfig(), Loss())
+    plain = module._command(0, "cpu", PretrainConfig(), GraspTask())
     assert plain == "qsgm pretrain -o sgm.pt --seed 0"
-    other = module._command(3, "cuda", TINY, Loss("paper"))
+    other = module._command(3, "cuda", TINY, GraspTask("paper"))
     assert other.removeprefix("qsgm pretrain -o sgm.pt --seed 3") == (
         " --device cuda --encoding paper --hidden 8"
     )
@@ -208,7 +208,7 @@ def test_the_card_says_where_the_backbone_was_trained(tmp_path: Path) -> None:
 
 def test_a_backbone_that_blows_up_leaves_nothing(tmp_path: Path) -> None:
     config = replace(TINY, backbone=replace(TINY.backbone, peak_rate=1e30))
-    with pytest.raises(QsgmError, match=r"stage `backbone`: GraspNet .* pass another --seed"):
+    with pytest.raises(QsgmError, match=r"stage `backbone`: ConvNet .* pass another --seed"):
         pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
     assert not list(tmp_path.iterdir())
 
@@ -227,7 +227,7 @@ def test_meta_training_that_blows_up_leaves_no_output(
         torch.nn.init.constant_(training.start[0][0], float("inf"))
 
     monkeypatch.setattr(MetaTraining, "run", blow_up)
-    with pytest.raises(QsgmError, match="stage `meta`: GraspNet"):
+    with pytest.raises(QsgmError, match="stage `meta`: ConvNet"):
         pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, TINY)
     assert not (tmp_path / "sgm.pt").exists()
 

@@ -11,8 +11,9 @@ import pytest
 
 from qsgm import QsgmError, cli
 from qsgm.blocks import parse_blocks
-from qsgm.bundle import Bundle, probe_file
+from qsgm.bundle import Bundle
 from qsgm.fidelity import cosine
+from qsgm.manifest import probe_file
 from qsgm.runtime import open_session
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_trace
 from qsgm.sgm.int8 import (
@@ -27,8 +28,8 @@ from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.sgm import int8_sgm
 from qsgm.train.graphs.sharing import SharedConstants
 from qsgm.tune.prepare import prepare
-from qsgm.tune.probe import activations_before, constants_of
-from qsgm.tune.recalibrate import ANY_LABEL, grown, ranges_of, recalibrated
+from qsgm.tune.probe import constants_of
+from qsgm.tune.recalibrate import ANY_LABEL, activations_before, grown, ranges_of, recalibrated
 from qsgm.tune.run import train
 from qsgm.tune.settings import Settings
 from tests.conftest import draw_frame

@@ -7,7 +7,8 @@ from onnx import helper
 
 from qsgm import QsgmError
 from qsgm.blocks import single_layers
-from qsgm.bundle import Bundle, probe_file, step_file, trunk_file
+from qsgm.bundle import Bundle
+from qsgm.manifest import probe_file, step_file, trunk_file
 from qsgm.runtime import open_session, run_options, running
 from qsgm.sgm.int8 import U8_ZERO, around_zero_point
 from qsgm.train.graphs.inspection import integer_operators

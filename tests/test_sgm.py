@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from qsgm.train.model.graspnet import CHANNELS
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import CHANNELS
 from qsgm.train.model.local import LayerState, local_step
 from qsgm.train.model.sgm import SGM_LAYERS, Sgm, SgmLayer, Teacher
 

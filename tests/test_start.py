@@ -5,9 +5,9 @@ import copy
 import torch
 from nets import random_net
 
-from qsgm.train.model.graspnet import Loss
+from qsgm.grasp.task import GraspTask
+from qsgm.train.model.fold import folded_start, write_back
 from qsgm.train.model.local import outputs
-from qsgm.train.model.start import folded_start, write_back
 from qsgm.train.pretraining.tasks import start_states
 
 
@@ -35,5 +35,5 @@ def test_what_is_written_back_folds_to_what_was_learnt() -> None:
 
 def test_the_loss_takes_its_encoding_from_its_name() -> None:
     raw = torch.tensor([[0.0, 0.0, 0.0]])
-    assert Loss("double").activate(raw)[0].tolist() == [0.5, 0.0, 0.0]
-    assert Loss("paper").activate(raw)[0].tolist() == [0.5, 0.0, 0.5]
+    assert GraspTask("double").activate(raw)[0].tolist() == [0.5, 0.0, 0.0]
+    assert GraspTask("paper").activate(raw)[0].tolist() == [0.5, 0.0, 0.5]

@@ -24,6 +24,7 @@ from torch.nn import functional as F
 
 from qsgm import QsgmError
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
+from qsgm.grasp.task import GraspTask
 from qsgm.sgm.float import FoldedConv, FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.train.graphs.build import Graph
@@ -36,9 +37,9 @@ from qsgm.train.graphs.layers import is_positive
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
+from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.curvature import FLAT, Curvature
-from qsgm.train.model.fold import FoldedNet, fold_net, fold_sgm, run_folded_conv, run_folded_sgm
-from qsgm.train.model.graspnet import Loss
+from qsgm.train.model.fold import fold_net, fold_sgm, run_folded_conv, run_folded_sgm
 from qsgm.train.model.sgm import Sgm
 from qsgm.tune.loop import StepLoop
 from qsgm.weights import to_step_layout
@@ -57,7 +58,7 @@ RATES = {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.002, 5: 0.005, 6: 0.02}
 # Input of the first tuned layer, by how many are tuned; of all six it is the pixels.
 POSITIONS = {1: 1, 2: 1, 3: 169, 4: 841, 5: 3844, 6: 16384}
 CHANNELS = {1: 16, 2: 16, 3: 16, 4: 8, 5: 8, 6: 3}
-LOSSES = [Loss(), Loss("paper", label_smoothing=0.0, angle_weight=3.0)]
+LOSSES = [GraspTask(), GraspTask("paper", label_smoothing=0.0, angle_weight=3.0)]
 TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
     Sgd: lambda groups: torch.optim.SGD(groups, momentum=0.9),
     Adam: torch.optim.Adam,
@@ -357,7 +358,7 @@ def test_a_few_steps_of_many_layers_equal_torchs(
 
 
 def compare_runs(net: FoldedNet, blocks: Blocks, optimizer: Optimizer, steps: int) -> None:
-    exported = compare_steps(net, blocks, quiet(random_sgms()), Loss(), optimizer, steps)
+    exported = compare_steps(net, blocks, quiet(random_sgms()), GraspTask(), optimizer, steps)
     start = {k: to_step_layout(net.layers[k - 1].weight) for k in blocks.layers}
     moved = [float(np.abs(exported.feeds[f"weight{k}"] - start[k]).max()) for k in start]
     assert max(moved) > 5e-3
@@ -474,7 +475,7 @@ def test_a_gate_is_one_above_zero_and_else_zero_however_small_or_large_a_number_
 def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
     data = random_data(1)
     data["features"] *= 1e5
-    exported = Exported(step_model(net, one_block(1), {}, Loss(), Sgd()), net, data)
+    exported = Exported(step_model(net, one_block(1), {}, GraspTask(), Sgd()), net, data)
     results = exported.step(np.arange(CROPS))
     assert all(np.isfinite(value).all() for value in results.values())
     assert results["loss"] > 1000
@@ -483,7 +484,7 @@ def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
 def seen_by_sgms(
     net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
 ) -> dict[int, SgmRanges]:
-    reference = Reference(net, tuned_layers(tuned), Loss(), Sgd())
+    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
     x, labels = picked(data, np.arange(len(data["labels"])))
     ranges = {}
     for number in tuned_layers(tuned)[:-1]:
@@ -520,12 +521,12 @@ def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
     blocks = parse_blocks(text)
     data, sgms, rows = random_data(len(blocks.layers), 12), random_sgms(hidden), np.arange(BATCH)
     int8_sgms = quantized(net, len(blocks.layers), data, sgms)
-    model = step_model(net, blocks, int8_sgms, Loss(), Sgd())
+    model = step_model(net, blocks, int8_sgms, GraspTask(), Sgd())
     products = 2 * len(sgms[4].convs) * len(blocks.sgm_layers)
     assert integer_operators(model) == ["QGemm"] * products
     refuse_float_products(text, model)
     exported = Exported(model, net, data)
-    reference = Reference(net, blocks.layers, Loss(), Sgd())
+    reference = Reference(net, blocks.layers, GraspTask(), Sgd())
     reference.step(data, rows, blocks, int8_sgms)
     exported.step(rows)
     assert_same_weights(exported, reference, 1e-5)
@@ -540,17 +541,17 @@ def test_the_probe_gives_true_float_and_int8_gradients(
 ) -> None:
     data, sgms, rows = random_data(tuned, 12), random_sgms(hidden), np.arange(BATCH)
     int8_sgms = quantized(net, tuned, data, sgms)
-    model = probe_model(net, tuned, sgms, int8_sgms, Loss())
+    model = probe_model(net, tuned, sgms, int8_sgms, GraspTask())
     assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
     got = Exported(model, net, data).step(rows)
 
-    reference = Reference(net, tuned_layers(tuned), Loss(), Sgd())
+    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
     x, labels = picked(data, rows)
     activations = {}
     for number in reference.convs:
         x = activations[number] = reference.layer(number, x)
     behind = {number: activations[number] for number in tuned_layers(tuned)[:-1]}
-    total = Loss().per_sample(x.flatten(1), labels).sum()
+    total = GraspTask().per_sample(x.flatten(1), labels).sum()
     truths = torch.autograd.grad(total, list(behind.values()))
     for (number, activation), truth in zip(behind.items(), truths, strict=True):
         seen = activation.detach()
@@ -572,8 +573,8 @@ def test_the_probes_updates_are_autograds_with_each_gradient_behind_the_layer(
 ) -> None:
     data, sgms, rows = random_data(tuned, 12), random_sgms(), np.arange(BATCH)
     int8_sgms = quantized(net, tuned, data, sgms)
-    got = Exported(probe_model(net, tuned, sgms, int8_sgms, Loss()), net, data).step(rows)
-    reference = Reference(net, tuned_layers(tuned), Loss(), Sgd())
+    got = Exported(probe_model(net, tuned, sgms, int8_sgms, GraspTask()), net, data).step(rows)
+    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
     x, _ = picked(data, rows)
     for number in tuned_layers(tuned)[:-1]:
         after, conv = reference.layer(number, x), reference.convs[number]
@@ -595,7 +596,7 @@ def test_the_probe_counts_inputs_beyond_their_ranges(net: FoldedNet) -> None:
     data, sgms = random_data(4, 12), random_sgms()
     int8_sgms = quantized(net, 4, data, sgms)
     data["labels"] = np.full((12, 3), 9, np.float32)
-    got = Exported(probe_model(net, 4, sgms, int8_sgms, Loss()), net, data).step(np.arange(9))
+    got = Exported(probe_model(net, 4, sgms, int8_sgms, GraspTask()), net, data).step(np.arange(9))
     for number in (3, 4, 5):
         assert got[f"clipped{number}"] == pytest.approx(3 / 19)
 
@@ -607,9 +608,9 @@ def test_blocks_run_one_after_the_other_so_that_their_memory_is_freed(
     blocks = parse_blocks(text)
     data, sgms = random_data(len(blocks.layers), BATCH), random_sgms()
     int8_sgms = quantized(net, len(blocks.layers), data, sgms)
-    exported = Exported(step_model(net, blocks, int8_sgms, Loss(), Sgd()), net, data)
+    exported = Exported(step_model(net, blocks, int8_sgms, GraspTask(), Sgd()), net, data)
     profiled = session(
-        step_model(net, blocks, int8_sgms, Loss(), Sgd()),
+        step_model(net, blocks, int8_sgms, GraspTask(), Sgd()),
         enable_profiling=True,
         profile_file_prefix=str(tmp_path / "run"),
     )
@@ -635,13 +636,13 @@ def test_gradients_are_carried_back_inside_blocks_only(
     net: FoldedNet, text: str, carried_back_through: int
 ) -> None:
     """5x5 layers through which a gradient is carried back: those of a block but its first."""
-    model = step_model(net, parse_blocks(text), random_sgms(), Loss(), Sgd())
+    model = step_model(net, parse_blocks(text), random_sgms(), GraspTask(), Sgd())
     kinds = [node.op_type for node in all_nodes(model.graph)]
     assert kinds.count("ConvTranspose") == carried_back_through
 
 
 def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
-    model = step_model(net, single_layers(2), random_sgms(), Loss(), Sgd())
+    model = step_model(net, single_layers(2), random_sgms(), GraspTask(), Sgd())
     state = [f"{kind}{layer}" for layer in (5, 6) for kind in ("weight", "bias")]
     state += [name[:-1] + "_momentum" + name[-1] for name in state]
     others = {"features", "labels", "rows", "rate5", "rate6"}
@@ -653,7 +654,7 @@ def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
 
 def test_there_is_nothing_to_probe_behind_the_last_layer(net: FoldedNet) -> None:
     with pytest.raises(QsgmError, match="SGMs of 1 tuned layers: the last layer has none"):
-        probe_model(net, 1, {}, {}, Loss())
+        probe_model(net, 1, {}, {}, GraspTask())
 
 
 @OPTIMIZERS
@@ -663,7 +664,7 @@ def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
 ) -> None:
     blocks = parse_blocks(text)
     data = random_data(len(blocks.layers))
-    model = step_model(net, blocks, quiet(random_sgms((64, 64))), Loss(), optimizer)
+    model = step_model(net, blocks, quiet(random_sgms((64, 64))), GraspTask(), optimizer)
     exported = Exported(model, net, data)
     start = {
         name: value.copy()
@@ -683,7 +684,7 @@ def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
 
 def test_the_loop_takes_other_crops_in_the_place_of_those_it_has(net: FoldedNet) -> None:
     data = random_data(3)
-    model = step_model(net, single_layers(3), quiet(random_sgms()), Loss(), Sgd())
+    model = step_model(net, single_layers(3), quiet(random_sgms()), GraspTask(), Sgd())
     start = {
         name: value.copy()
         for name, value in Exported(model, net, data).feeds.items()
@@ -704,8 +705,8 @@ def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:
     sgms = random_sgms()
     del sgms[4]
     with pytest.raises(QsgmError, match=r"no SGM for layers \[4\]: tuning 4,5,6 needs"):
-        step_model(net, single_layers(3), sgms, Loss(), Sgd())
-    step_model(net, parse_blocks("4-5,6"), sgms, Loss(), Sgd())
+        step_model(net, single_layers(3), sgms, GraspTask(), Sgd())
+    step_model(net, parse_blocks("4-5,6"), sgms, GraspTask(), Sgd())
 
 
 @pytest.mark.parametrize("text", ["4,5,6", "5,6", "3-4,5,6"])
@@ -719,7 +720,7 @@ def test_gradients_are_bent_in_the_graph_as_they_are_in_torch(net: FoldedNet, te
     }
     momenta = []
     for used in (FLAT, curvatures):
-        exported = Exported(step_model(net, blocks, sgms, Loss(), Sgd(), used), net, data)
+        exported = Exported(step_model(net, blocks, sgms, GraspTask(), Sgd(), used), net, data)
         momenta.append(exported.step(rows))
     for k, curvature in curvatures.items():
         plain, bent = (

@@ -7,14 +7,21 @@ import torch
 from qsgm.errors import QsgmError
 from qsgm.grasp.angles import AngleEncoding, angle_error, decode_angle, encode_angle
 from qsgm.grasp.crops import label_crops, plan_crops
-from qsgm.train.model.graspnet import GraspNet, Loss
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
+from qsgm.train.model.fold import folded_start
 from qsgm.train.model.local import true_gradients
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.pretraining.backbone import BackboneConfig, BackboneTraining
 from qsgm.train.pretraining.evaluate import Score, best_rates, score
 from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
-from qsgm.train.pretraining.tasks import CropStream, TaskSet, axis_offset, draw_tasks, start_states
+from qsgm.train.pretraining.tasks import (
+    TaskSet,
+    axis_offset,
+    draw_tasks,
+    start_states,
+)
 
 
 def raw_for(angle_rad: np.ndarray, quality: np.ndarray) -> torch.Tensor:
@@ -27,7 +34,7 @@ def raw_for(angle_rad: np.ndarray, quality: np.ndarray) -> torch.Tensor:
 def test_the_offset_is_how_the_network_sees_the_demonstration_turned(offset: float) -> None:
     plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0), 200)
     raw = raw_for(plan.turn_rad + offset, plan.quality)
-    assert angle_error(np.array(axis_offset(raw, plan, Loss())), np.array(offset)) < 1e-3
+    assert angle_error(np.array(axis_offset(raw, plan, GraspTask())), np.array(offset)) < 1e-3
 
 
 def test_a_drawn_batch_depends_on_its_number_and_seed_only() -> None:
@@ -43,7 +50,7 @@ def test_a_drawn_batch_depends_on_its_number_and_seed_only() -> None:
 @pytest.mark.parametrize("encoding", ["double", "paper"])
 def test_the_backbone_is_taught_angles_as_its_loss_encodes_them(encoding: AngleEncoding) -> None:
     config = BackboneConfig(steps=3, frames_per_batch=4, crops_per_frame=6, loader_processes=0)
-    training = BackboneTraining(config, Loss(encoding), 5, "cpu")
+    training = BackboneTraining(config, GraspTask(encoding), 5, "cpu")
     (_, labels), *_ = training._batches()
     drawn_with = {name: CropStream(5, 12, 6, name)[0][1] for name in ("double", "paper")}
     assert not torch.equal(drawn_with["double"], drawn_with["paper"])
@@ -54,7 +61,7 @@ def test_the_backbone_is_taught_angles_as_its_loss_encodes_them(encoding: AngleE
 
 @pytest.mark.parametrize("encoding", ["double", "paper"])
 def test_the_score_agrees_with_numpy(encoding: AngleEncoding) -> None:
-    loss = Loss(encoding)
+    loss = GraspTask(encoding)
     plan = plan_crops((480, 640), (320, 240), np.random.default_rng(1), 60)
     labels = torch.tensor(label_crops(plan, encoding=encoding))[None]
     generator = torch.Generator().manual_seed(0)
@@ -84,7 +91,7 @@ def test_both_sides_of_the_seam_are_close(encoding: AngleEncoding) -> None:
     raw = torch.stack([torch.ones(2), channels[:, 0].atanh(), cosine], dim=1)[None]
     start = [(torch.eye(3), torch.zeros(3))]
     tasks = TaskSet(raw[:, :, None], torch.tensor(labels, dtype=torch.float32)[None], support=0)
-    got = score(start_states(start, 1), tasks, Loss(encoding))[0]
+    got = score(start_states(start, 1), tasks, GraspTask(encoding))[0]
     assert got[2] == pytest.approx(2.0, abs=1e-2)
 
 
@@ -106,7 +113,7 @@ def test_of_rates_that_do_as_well_the_first_are_taken() -> None:
 
 def test_recorded_examples_hold_true_gradients_and_an_sgm_learns_them() -> None:
     torch.manual_seed(0)
-    net, loss = GraspNet().eval(), Loss()
+    net, loss = ConvNet(GRASPNET).eval(), GraspTask()
     tasks = draw_tasks(net, 2, 80, 9, loss, lambda: None)
     start = folded_start(net, 3)
     config = MatchingConfig(epochs=1, record_every=1, fit_steps=150, fit_batch=64)

@@ -13,9 +13,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nets import random_net
+from qsgm.train.quantization.calibration_set import Demonstration
 
 from qsgm import QsgmError
 from qsgm.blocks import one_block, single_layers
+from qsgm.grasp.task import GraspTask
 from qsgm.runtime import session_options
 from qsgm.sgm.float import FloatArray
 from qsgm.train.graphs.build import Graph
@@ -28,12 +30,13 @@ from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.step import step_model
 from qsgm.train.graphs.trunk import int8_layer, int8_trunk_model, trunk_model
+from qsgm.train.grasp.calibration_set import CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
-from qsgm.train.model.fold import FoldedLayer, FoldedNet, fold_net, fold_sgm
-from qsgm.train.model.graspnet import Loss, normalize
+from qsgm.train.model.arrays import FoldedLayer, FoldedNet
+from qsgm.train.model.fold import fold_net, fold_sgm
+from qsgm.train.model.net import normalize
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.quantization import trunk_ranges
-from qsgm.train.quantization.calibration_set import CalibrationSet, Demonstration
 from qsgm.train.quantization.trunk import (
     HEADROOM,
     LayerRange,
@@ -255,7 +258,7 @@ def test_rounding_the_first_layers_weights_costs_nothing_on_grey_pixels(net: Fol
 def test_a_step_trains_on_u8_features_as_on_their_values_in_float(
     net: FoldedNet, tuned: int
 ) -> None:
-    rng, loss = np.random.default_rng(tuned), Loss()
+    rng, loss = np.random.default_rng(tuned), GraspTask()
     torch.manual_seed(0)
     sgms = {k: fold_sgm(Sgm(k, (8,)).eval()) for k in range(7 - tuned, 6)}
     blocks = single_layers(tuned) if tuned > 1 else one_block(1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from toys import bump, by_correlation, lay, table, toy
 
 from qsgm import QsgmError, load_object
-from qsgm.bundle import NETWORK, Bundle
+from qsgm.bundle import Bundle
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.heatmap import Detection, Place, locate, refine
 from qsgm.grasp.patch import cut_patch
@@ -24,6 +24,7 @@ from qsgm.grasp.tuned import (
     TunedObject,
     save_object,
 )
+from qsgm.manifest import NETWORK
 
 Point = tuple[float, float]
 MUG = ObjectDescription("mug", "double", 0.25)
