@@ -40,7 +40,7 @@ def single_layers(layers: range) -> Blocks:
 
 
 def one_block(layers: range) -> Blocks:
-    """These layers as one block: backpropagation."""
+    """All layers in one block, which is backpropagation."""
     return Blocks((layers,))
 
 

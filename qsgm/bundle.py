@@ -126,7 +126,7 @@ class Bundle:
         return None if file is None else file.peak_activation_bytes
 
     def activation_bits(self, layer: int) -> ActivationBits:
-        """Of the int8 SGM behind a layer."""
+        """Bits of an activation in the int8 SGM behind a layer."""
         return self.manifest.sgms[layer].bits
 
     def float_sgm(self, layer: int) -> FoldedSgm:
@@ -139,7 +139,7 @@ class Bundle:
         return FoldedSgm(layer, self.network.after(layer), tuple(convs))
 
     def start_weights(self, layers: range) -> dict[str, NDArray[np.float32]]:
-        """These layers' starting weights (Co, Ci, kh, kw) and biases (Co,), by name."""
+        """Starting weights (Co, Ci, kh, kw) and biases (Co,) of some layers, by name."""
         data = (self.folder / NETWORK).read_bytes()
         names = [f"{kind}{k}" for k in layers for kind in ("weight", "bias")]
         return {name: array_at(data, self.manifest.initializers[name]) for name in names}
@@ -156,7 +156,7 @@ class Bundle:
         return bytes(data)
 
     def sha256(self) -> str:
-        """Of the manifest, and so of everything in it."""
+        """Digest of the manifest, and so of everything in the bundle."""
         return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
 
 

@@ -208,7 +208,7 @@ class Network:
 
     @cached_property
     def _maps(self) -> tuple[Pair, ...]:
-        """Of the input, then behind every layer."""
+        """Sides of the maps: the input's, then those behind every layer."""
         maps = [(self.input_shape[0], self.input_shape[1])]
         for layer in self.layers:
             maps.append(layer.pooled(layer.convolved(maps[-1])))

@@ -104,7 +104,7 @@ class Labelled(Protocol):
 
     @property
     def labels(self) -> Array:
-        """Of all samples, (N, L)."""
+        """Labels of all samples, (N, L)."""
         ...
 
     def scores(self, outputs: Array, rows: Rows) -> Scores:

@@ -60,7 +60,7 @@ class CalibratorName(StrEnum):
 
 
 class ActivationBitsChoice(StrEnum):
-    """Of int8 SGMs' inputs and hidden tensors."""
+    """Bits of int8 SGMs' inputs and hidden tensors."""
 
     EIGHT = "8"
     SIXTEEN = "16"

@@ -42,7 +42,7 @@ class Aligner:
 
     @staticmethod
     def of(template: Template) -> "Aligner":
-        """Of the demonstration's patch."""
+        """What alignment keeps of a demonstration's patch."""
         cells = Cells.of(template)
         right, down = (one / 2 for one in slopes(cells.image))
         at = np.arange(SIDE, dtype=np.float32) - (SIDE - 1) / 2
@@ -130,7 +130,7 @@ def slopes(image: Floats) -> tuple[Floats, Floats]:
 
 
 def _means(image: Floats, cells: Cells) -> Floats:
-    """Of every cell (C, K) of an image (64, 64, ...) with K numbers a pixel."""
+    """Mean (C, K) of every cell of an image (64, 64, ...) with K numbers a pixel."""
     sums = sums_by_cell(image.reshape(SIDE, SIDE, -1))
     return np.asarray(sums / cells.size[:, None], dtype=np.float32)
 

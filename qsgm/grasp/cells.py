@@ -37,7 +37,7 @@ class Cells:
 
     @staticmethod
     def of(template: Template) -> "Cells":
-        """Of the demonstration's patch."""
+        """What comparison by cells keeps of a demonstration's patch."""
         image, solid = upright(template)
         each = np.repeat(solid[..., None], _CHANNELS, axis=2)
         covered = image * each

@@ -102,7 +102,7 @@ def _often_named(
 
 
 def dimmed(plan: CropPlan, rng: np.random.Generator) -> CropPlan:
-    """The same crops, some of them in less light."""
+    """A plan in which some of the crops have less light."""
     count = len(plan)
     dim = np.where(rng.random(count) < DIM_SHARE, rng.uniform(DIMMEST, 1.0, count), 1.0)
     return replace(plan, color=(plan.color * dim[:, None, None]).astype(np.float32))

@@ -16,7 +16,7 @@ _BINS = 12
 
 @dataclass(frozen=True)
 class Colours:
-    """Of the pixels of one object, as logarithms of red over green and blue over green."""
+    """Colours of one object's pixels, as logarithms of red over green and blue over green."""
 
     middle: Floats  # (2,), medians
     histogram: Floats  # (12, 12), sums to 1
@@ -24,7 +24,7 @@ class Colours:
 
     @staticmethod
     def of(pixels: Floats) -> "Colours":
-        """Of pixels (N, 3) BGR, at least one."""
+        """Colours of pixels (N, 3) BGR, at least one."""
         logs = np.log(pixels + np.float32(DARK))
         ratios = np.stack([logs[:, 2] - logs[:, 1], logs[:, 0] - logs[:, 1]], axis=1)
         bins = ((ratios + _LARGEST) * (_BINS / (2 * _LARGEST))).astype(np.int64)

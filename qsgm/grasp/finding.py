@@ -64,7 +64,7 @@ class Sighting:
 
     @property
     def confidence(self) -> float | None:
-        """That the turn is not the opposite one; None where that is not known."""
+        """Confidence that the turn is not the opposite one; None where that is not known."""
         return confidence_of(self.lead) if self.view.whole else None
 
     @property
@@ -83,7 +83,7 @@ class Finder:
 
     @cached_property
     def appearances(self) -> tuple[Appearance, ...]:
-        """Of the views, made when they are first needed."""
+        """Looks of all views, made when they are first needed."""
         return tuple(Appearance.of(view.patch) for view in self.views)
 
     def find(
@@ -117,7 +117,7 @@ class Finder:
 
 
 def confidence_of(lead: float) -> float:
-    """That a fit's way round is right, by its correlation's lead over the opposite one."""
+    """Confidence that a fit's way round is right, by its lead over the opposite one."""
     return float(1 / (1 + np.exp(-_LEAD_SLOPE * lead)))
 
 
@@ -127,7 +127,7 @@ def full_degrees(turn_rad: float) -> float:
 
 
 def _distinct(sightings: Sequence[Sighting], frame_hw: tuple[int, int]) -> list[Sighting]:
-    """Those that do not lie over a better one."""
+    """Sightings that do not lie over a better one."""
     kept: list[tuple[Sighting, NDArray[np.bool_]]] = []
     for one in sightings:
         footprint = _footprint(one, frame_hw)

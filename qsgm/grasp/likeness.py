@@ -25,7 +25,7 @@ _MIDDLE_PX = (PATCH_PX - 1) / 2
 
 @dataclass(frozen=True)
 class Likeness:
-    """Of a demonstration's patch, to what it could be taken for."""
+    """Likeness of a demonstration's patch to what it could be taken for."""
 
     cut_out: bool  # whether its pixels could be told from the table
     featureless: bool
@@ -50,7 +50,7 @@ def likeness_of(patch: Patch) -> Likeness:
 
 
 def inner_variance(patch: Patch) -> float:
-    """Of the object's pixels, all channels together, without its rim where that leaves enough."""
+    """Variance of an object's pixels, all channels together, without its rim if enough is left."""
     inner = cv2.erode(patch.mask, np.ones((_RIM_PX, _RIM_PX), np.uint8)) > 0
     solid = patch.mask > 0
     enough = inner.sum() > _INNER_SHARE * solid.sum()

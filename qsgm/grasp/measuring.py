@@ -168,7 +168,7 @@ def _span(frame: Frame, center_px: Point) -> float | None:
 
 
 def _agreed(spans: Sequence[float | None]) -> float | None:
-    """Of spans in one halving after the other: the largest on which two neighbours agree."""
+    """The largest span on which two neighbouring halvings agree."""
     pairs = [(a, b) for a, b in pairwise(spans) if a and b]
     same = [a for a, b in pairs if max(a, b) <= _SAME_SPAN * min(a, b)]
     return max(same, default=None)

@@ -27,7 +27,7 @@ class Other:
 
     @property
     def sha256(self) -> str:
-        """Of its pixels and its mask."""
+        """Digest of its pixels and its mask."""
         pixels = np.dstack([self.patch.image, self.patch.mask])
         return hashlib.sha256(pixels.tobytes()).hexdigest()
 

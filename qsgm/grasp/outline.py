@@ -29,7 +29,7 @@ class Outline:
 
     @staticmethod
     def of(solid: Floats) -> "Outline":
-        """Of the largest part of a mask (h, w), 0 to 1."""
+        """Outline of the largest part of a mask (h, w), 0 to 1."""
         high = (solid >= min(0.5, float(solid.max()))).astype(np.uint8)
         found, _ = cv2.findContours(high, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         points = _evenly(max(found, key=len)[:, 0].astype(np.float64), STRETCHES * _POINTS)

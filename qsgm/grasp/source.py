@@ -95,7 +95,7 @@ def crop_source(
 
 
 def _shuffled(source: CropSource, rng: np.random.Generator) -> CropSource:
-    """The same crops in random order, so that validation has some of every demonstration."""
+    """Crops in random order, so that held-out ones show every demonstration."""
     order = rng.permutation(len(source))
     clutter = None if source.clutter is None else source.clutter[order]
     return replace(source, shown=source.shown[order], plan=source.plan[order], clutter=clutter)

@@ -138,7 +138,7 @@ class QuantizedSgm:
 
     @property
     def codes(self) -> Codes:
-        """Of inputs and hidden tensors."""
+        """How inputs and hidden tensors become codes."""
         return CODES[self.bits]
 
     @property
@@ -296,7 +296,7 @@ def constants(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
 
 
 def constants_of_two_planes(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
-    """The same of an 8 bit SGM for a 16 bit one's graph, where it gives the same gradients.
+    """Constants of an 8 bit SGM for a 16 bit one's graph, where it gives the same gradients.
 
     Its codes become the high plane, and the low plane's steps are so long that it is zero. With it
     calibrations of 8 bits can be tried on a bundle of 16; but underflow is then counted in steps of
@@ -319,7 +319,7 @@ def constants_of_two_planes(q: QuantizedSgm) -> dict[str, NDArray[Any]]:
 def product_constants(
     i: int, product: QuantizedProduct, taps: int, step: np.float32
 ) -> dict[str, NDArray[Any]]:
-    """Of the i-th product, whose results are times `step`: both planes of its weights, and so on.
+    """Constants of the i-th product, whose results are times `step`, by name.
 
     A window's channels of one tap lie together, first the fine plane's, then the coarse one's.
     """
@@ -382,7 +382,7 @@ def integer_trace(
 
 
 def underflow_fraction(q: QuantizedSgm, inputs: FloatArray) -> float:
-    """Of the inputs (N, P, Ci) other than 0, the fraction that is rounded to 0's code."""
+    """Fraction of the inputs (N, P, Ci) other than 0 that is rounded to 0's code."""
     size = np.abs(inputs)
     small = (size > 0) & (size * q.input_gain < UNDERFLOW_STEPS)
     return float(small.sum() / max(1, np.count_nonzero(size)))

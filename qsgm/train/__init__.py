@@ -1,1 +1,50 @@
 """The host side: drawing, pretraining, folding, quantizing, exporting. Needs the extra `train`."""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+    from qsgm.train.export import ExportOptions, export_bundle
+    from qsgm.train.export_report import ExportReport
+    from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
+    from qsgm.train.quantization.lessons import Lessons
+    from qsgm.train.slim import SlimReport, slim_bundle
+    from qsgm.train.task import DrawnTask
+else:
+    # Imported when asked for, since most bring in torch.
+    _HOME = {
+        "Checkpoint": "qsgm.train.checkpoint",
+        "DrawnTask": "qsgm.train.task",
+        "ExportOptions": "qsgm.train.export",
+        "ExportReport": "qsgm.train.export_report",
+        "Lessons": "qsgm.train.quantization.lessons",
+        "PretrainConfig": "qsgm.train.pretraining.pretrain",
+        "SlimReport": "qsgm.train.slim",
+        "export_bundle": "qsgm.train.export",
+        "load_checkpoint": "qsgm.train.checkpoint",
+        "pretrain": "qsgm.train.pretraining.pretrain",
+        "save_checkpoint": "qsgm.train.checkpoint",
+        "slim_bundle": "qsgm.train.slim",
+    }
+
+    def __getattr__(name: str) -> object:
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_HOME[name]), name)
+
+
+__all__ = [
+    "Checkpoint",
+    "DrawnTask",
+    "ExportOptions",
+    "ExportReport",
+    "Lessons",
+    "PretrainConfig",
+    "SlimReport",
+    "export_bundle",
+    "load_checkpoint",
+    "pretrain",
+    "save_checkpoint",
+    "slim_bundle",
+]

@@ -159,7 +159,7 @@ def with_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Watch) -> Manife
 
 
 def every_block(network: Network, most_layers: int, blocks: Sequence[Blocks]) -> list[Blocks]:
-    """Those with SGMs, and all layers as one block for every number of them."""
+    """Blocks with SGMs, and for every number of layers all of them as one block."""
     whole = (one_block(network.last(tuned)) for tuned in range(1, most_layers + 1))
     return list(dict.fromkeys([*blocks, *whole]))
 
@@ -236,7 +236,7 @@ def exported_blocks(network: Network, most_layers: int, more: Sequence[Blocks]) 
 def calibrate_trunk(
     trainee: Trainee, lessons: Lessons, watch: Watch
 ) -> tuple[Trainee, dict[int, QuantizedLayer]]:
-    """The same with steps for u8 features, and its layers that can be frozen in int8."""
+    """A trainee with steps for u8 features, and its layers that can be frozen in int8."""
     ranges = observe_trunk(trainee.net, lessons, SEED, watch)
     net = replace(trainee.net, feature_steps=feature_steps(ranges))
     return replace(trainee, net=net), quantize_trunk(net, ranges)
@@ -377,5 +377,5 @@ def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:
 
 
 def sha256(data: bytes) -> str:
-    """As hexadecimal digits."""
+    """Digest in hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()

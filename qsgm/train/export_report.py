@@ -45,12 +45,12 @@ class LayerReport:
 
     @property
     def float_bytes(self) -> int:
-        """Of its constants."""
+        """Bytes of the float SGM's constants."""
         return sum(conv.weight.nbytes + conv.bias.nbytes for conv in self.sgm.convs)
 
     @property
     def int8_bytes(self) -> int:
-        """Of its constants, scales included."""
+        """Bytes of the int8 SGM's constants, scales included."""
         return sum(array.nbytes for array in constants(self.int8_sgm).values())
 
     @property
@@ -186,7 +186,7 @@ def ranges_from(calibration: Calibration) -> str:
 
 
 def calibrator_headers(calibration: Calibration) -> list[str]:
-    """Of the columns of :func:`calibrator_rows`."""
+    """Headers of the columns of :func:`calibrator_rows`."""
     return ["layer", *next(iter(calibration.cosines.values())), "taken"]
 
 

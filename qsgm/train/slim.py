@@ -47,7 +47,7 @@ class SlimReport:
 
     @property
     def total_bytes(self) -> int:
-        """Of all files."""
+        """Bytes of all files."""
         return sum(self.bytes.values())
 
     def to_json(self) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class Prepared:
 
     @property
     def labels(self) -> Array:
-        """Of all samples, (N, L)."""
+        """Labels of all samples, (N, L)."""
         return self.labelled.labels
 
     @property

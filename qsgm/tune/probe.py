@@ -73,7 +73,7 @@ def feeds_of(
 
 
 def constants_of(overrides: Overrides, layers: Collection[int]) -> dict[str, NDArray[Any]]:
-    """Those of the SGMs behind `layers`, by initializer name."""
+    """Overriding constants of the SGMs behind `layers`, by initializer name."""
     return {name: array for layer in layers for name, array in overrides.get(layer, {}).items()}
 
 

@@ -32,7 +32,7 @@ MOST_LABELS = 16  # that every activation is seen beside
 
 
 def recalibrate(prepared: Prepared, plan: Plan) -> Plan:
-    """The same run with int8 SGMs calibrated on the samples it is to learn from.
+    """A run's plan with int8 SGMs calibrated on the samples it is to learn from.
 
     Raises:
         QsgmError: the run has no int8 SGM, or the bundle no probe to see activations with.

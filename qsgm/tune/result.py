@@ -32,7 +32,7 @@ class Result:
 
     @property
     def untouched(self) -> Scores:
-        """The same samples, by the network before any step."""
+        """Scores of the network before any step, on the held-out samples."""
         return self.prepared.untouched
 
     @property
@@ -50,7 +50,7 @@ class Result:
 
     @property
     def peak_activation_bytes(self) -> dict[str, int | None]:
-        """Of a step, with SGMs and by backpropagation."""
+        """Bytes of activations alive in a step, with SGMs and by backpropagation."""
         precision = self.plan.settings.precision
         return peak_activation_bytes(self.prepared.bundle, precision, self.plan.sgm_blocks)
 

@@ -173,7 +173,7 @@ class Ops:
         return list(node.output[: len(sums)]), list(node.output[len(sums) :])
 
     def outside(self) -> "Ops":
-        """The same around all loops."""
+        """Operators of the graph around all loops."""
         graph = self.graph
         while graph.around is not None:
             graph = graph.around

@@ -49,12 +49,12 @@ class TunedLayer:
 
     @property
     def side(self) -> Pair:
-        """Of its input map."""
+        """Sides of its input map."""
         return self.network.before(self.number)
 
     @property
     def after_side(self) -> Pair:
-        """Of the map behind its pool."""
+        """Sides of the map behind its pool."""
         return self.network.after(self.number)
 
     @property
@@ -99,7 +99,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Of a layer's parameters."""
+    """Gradients of a layer's parameters."""
 
     weight: Gradient  # (Co, K)
     bias: Gradient  # (1, Co)
@@ -263,7 +263,7 @@ def summed_gradients(op: Ops, done: Pass, dz: Value) -> Gradients:
 
 
 def weight_gradients(op: Ops, layer: TunedLayer, summed: Gradients) -> Gradients:
-    """The same where windows are codes, of which a step stands for something."""
+    """Gradients in the weights' own units, where windows are codes that stand for steps."""
     if layer.steps is None:
         return summed
     weight = op.Mul(value_of(op, summed.weight), op.constant(layer.steps))

@@ -8,7 +8,7 @@ from qsgm.train.heads import LOSSES
 
 
 def channels(op: Ops, x: Value, some: range) -> Value:
-    """These channels of (B, C, ...)."""
+    """Slice of the channels of (B, C, ...)."""
     return op.Slice(x, op.shape(some.start), op.shape(some.stop), op.shape(1))
 
 

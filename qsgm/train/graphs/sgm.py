@@ -93,7 +93,7 @@ def padded(op: Ops, x: Value, side: Pair, kernel: Pair, channels: int) -> Value:
 
 
 def framed_side(side: Pair, kernel: Pair) -> Pair:
-    """Of maps with as many zeros around them as a window reaches out."""
+    """Sides of maps with as many zeros around them as a window reaches out."""
     height, width = (length + 2 * (reach // 2) for length, reach in zip(side, kernel, strict=True))
     return height, width
 
@@ -180,7 +180,7 @@ def clipped_fraction(op: Ops, sgm: QuantizedSgm, scaled: Value) -> Value:
 
 
 def underflow_fraction(op: Ops, sgm: QuantizedSgm, seen: Value) -> Value:
-    """Of the inputs other than 0, the share that is rounded to 0; a scalar."""
+    """Share of the inputs other than 0 that is rounded to 0; a scalar."""
     size, nothing = op.Abs(seen), op.constant(0.0)
     there = op.Greater(size, nothing)
     below = op.Less(op.Mul(size, f"sgm{sgm.layer}/gain"), op.constant(UNDERFLOW_STEPS))

@@ -125,7 +125,7 @@ def whole_block(
 def block_by_crops(
     graph: Graph, block: list[TunedLayer], sgm: AnySgm, x: Value, batch: Batch
 ) -> tuple[list[Gradients], Value]:
-    """The same with one crop's windows in memory at a time.
+    """A block's gradients with one sample's windows in memory at a time.
 
     With an SGM behind it a block asks nothing of the layers behind, and its gradients are sums over
     crops: what has to be there for all of them is no more than what it reads and gives.
@@ -150,7 +150,7 @@ def block_by_crops(
 
 
 def gradient_shapes(layer: TunedLayer) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Of a layer's weight and bias."""
+    """Shapes of the gradients of a layer's weight and bias."""
     return (layer.layer.out, layer.layer.window), (1, layer.layer.out)
 
 

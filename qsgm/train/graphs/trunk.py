@@ -45,7 +45,7 @@ def trunk_model(net: FoldedNet, last_frozen: int) -> ModelProto:
 def int8_trunk_model(
     net: FoldedNet, layers: Mapping[int, QuantizedLayer], last_frozen: int
 ) -> ModelProto:
-    """The same in integers, from `samples` to u8 `features` with the same steps.
+    """The frozen layers in integers: `samples` to u8 `features` with the same steps.
 
     Args:
         net: with steps for layer `last_frozen`.

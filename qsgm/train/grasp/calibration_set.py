@@ -86,7 +86,7 @@ class CalibrationLessons:
 
     @property
     def sha256(self) -> str:
-        """Of the manifest, and so of every frame."""
+        """Digest of the manifest, and so of every frame."""
         return hashlib.sha256(self.frames.manifest_bytes).hexdigest()
 
     def lesson(self, i: int, rng: np.random.Generator, count: int) -> GraspLesson:

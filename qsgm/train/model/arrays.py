@@ -52,7 +52,7 @@ FLAT_ARRAYS: Mapping[int, CurvatureArrays] = MappingProxyType({})
 
 
 def on_pixels(net: FoldedNet) -> FoldedNet:
-    """The same network on raw pixel values, 0 to 255: the first layer normalises them.
+    """A network that takes raw pixel values, 0 to 255: its first layer normalises them.
 
     For one whose first layer is not padded: every window then sees the same offset. Only where that
     layer is frozen; tuned it sees pixels in [-1, 1], as in pretraining, since the same rate means

@@ -94,6 +94,6 @@ class BackboneTraining:
 
 
 def in_memory_format(net: ConvNet, memory_format: torch.memory_format) -> ConvNet:
-    """The same network with its weights laid out otherwise; torch's types do not know the call."""
+    """A network with its weights laid out otherwise; torch's types do not know the call."""
     net.to(memory_format=memory_format)  # type: ignore[call-overload]
     return net

@@ -129,7 +129,7 @@ class MapMatching:
 def behind(
     network: Network, layers: Sequence[tuple[Tensor, Tensor]], tasks: TaskSet, first: int = 1
 ) -> TaskSet:
-    """The same tasks seen from behind the first of their layers, numbered from `first`."""
+    """Tasks as they are seen from behind some of their layers, numbered from `first`."""
     features = []
     for one in tasks.chunks(1):
         slices = one.features.split(SLICE, dim=1)
@@ -150,7 +150,7 @@ def _forward(
 
 @torch.no_grad()
 def _scaled(sgm: Sgm, factor: float) -> Sgm:
-    """The same SGM, its gradients times `factor`."""
+    """An SGM that gives its gradients times `factor`."""
     last = sgm.convs[-1]
     for parameter in last.parameters():
         parameter.mul_(factor)

@@ -77,7 +77,7 @@ class TaskSet:
         return len(self.labels)
 
     def chunks(self, size: int) -> Iterator["TaskSet"]:
-        """The same tasks in groups of at most `size`."""
+        """Tasks in groups of at most `size`."""
         for start in range(0, len(self), size):
             rows = slice(start, start + size)
             yield TaskSet(self.features[rows], self.labels[rows], self.support)
@@ -115,7 +115,7 @@ def draw_tasks(
 
 
 def start_states(start: Sequence[tuple[Tensor, Tensor]], tasks: int) -> list[LayerState]:
-    """The same start (weight (K, Co), bias (Co,)) of every tuned layer for each task."""
+    """States of every tuned layer that start alike, (K, Co) and (Co,), for each task."""
     return [
         LayerState.start(weight.expand(tasks, -1, -1), bias.expand(tasks, -1))
         for weight, bias in start

@@ -18,7 +18,7 @@ class Lessons(Protocol):
 
     @property
     def sha256(self) -> str:
-        """Of everything in it."""
+        """Digest of everything in it."""
         ...
 
     def lesson(self, i: int, rng: np.random.Generator, count: int) -> Lesson:

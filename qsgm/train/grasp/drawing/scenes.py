@@ -321,7 +321,7 @@ def _cutout(
 
 
 def _single(light: Light) -> Light:
-    """The same light in Python's numbers: NumPy's own would make the shading double precision."""
+    """Light in Python's numbers: NumPy's own would make the shading double precision."""
     return Light(float(light.x), float(light.y), float(light.z))
 
 
