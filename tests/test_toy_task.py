@@ -55,10 +55,15 @@ class ToyLessons:
     def __len__(self) -> int:
         return 4
 
-    def lesson(self, i: int, rng: np.random.Generator, count: int) -> ToyLesson:
+    def lesson(self, i: int, rng: np.random.Generator, count: int) -> ToyLesson:  # noqa: ARG002
         return TASK.lesson(rng, count)
 
-    def samples(self, i: int, rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
+    def samples(
+        self,
+        i: int,  # noqa: ARG002
+        rng: np.random.Generator,
+        count: int,
+    ) -> NDArray[np.uint8]:
         return TASK.lesson(rng, count).pixels
 
 

@@ -44,7 +44,7 @@ class ToyLesson:
     def cut(self, rows: Rows) -> NDArray[np.uint8]:
         return self.pixels[rows]
 
-    def labelled(self, untouched: NDArray[np.float32]) -> "ToyLesson":
+    def labelled(self, untouched: NDArray[np.float32]) -> "ToyLesson":  # noqa: ARG002
         return self
 
     def scores(self, outputs: NDArray[np.float32], rows: Rows) -> dict[str, float | None]:

@@ -30,12 +30,17 @@ class Prepared:
 
     bundle: Bundle
     plan: Plan  # by which it was prepared
-    taught: int  # samples that are learnt from; those behind them are held out
+    lesson: Lesson
     source: FeatureSource
     labelled: Labelled
     start: dict[str, Array]  # weights and biases, in the step graphs' layout
     untouched: Scores  # of the network before any step, on the held-out samples
     seconds: dict[str, float]  # crops, features, total
+
+    @property
+    def taught(self) -> int:
+        """How many samples are learnt from; those behind them are held out."""
+        return self.lesson.taught
 
     @property
     def labels(self) -> Array:
@@ -80,7 +85,7 @@ def prepare(lesson: Lesson, bundle: Bundle, plan: Plan, watch: Progress | None =
     untouched = labelled.scores(outputs[held_out], held_out)
     # What is streamed later is part of other stages.
     seconds = seconds | {"total": time.perf_counter() - began}
-    return Prepared(bundle, plan, lesson.taught, source, labelled, start, untouched, seconds)
+    return Prepared(bundle, plan, lesson, source, labelled, start, untouched, seconds)
 
 
 def outputs_of(
