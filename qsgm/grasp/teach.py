@@ -31,7 +31,7 @@ from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import distractors_of, task_of
 from qsgm.grasp.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.grasp.verdict import Verdict, verdict_on
-from qsgm.tune.features import Progress
+from qsgm.progress import Progress
 from qsgm.tune.plan import Plan, resolve
 from qsgm.tune.prepare import Prepared, prepare
 from qsgm.tune.result import Result

@@ -36,6 +36,7 @@ from qsgm.manifest import (
     trunk_file,
 )
 from qsgm.network import Network
+from qsgm.progress import Progress
 from qsgm.schedule import BATCH
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
@@ -59,7 +60,7 @@ from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sg
 from qsgm.train.model.net import as_seen
 from qsgm.train.quantization.calibrate import AUTO, calibrate
 from qsgm.train.quantization.calibration_runs import EPOCHS, Trainee, prepare
-from qsgm.train.quantization.lessons import Lessons, Watch
+from qsgm.train.quantization.lessons import Lessons
 from qsgm.train.quantization.sgm_fidelity import measure
 from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
 from qsgm.train.quantization.trunk_ranges import observe_trunk
@@ -93,7 +94,7 @@ def export_bundle(
     lessons: Lessons,
     output_folder: Path,
     task_files: Mapping[str, bytes],
-    watch: Watch,
+    watch: Progress,
     options: ExportOptions = ExportOptions(),
 ) -> ExportReport:
     """Export a checkpoint as a bundle.
@@ -142,7 +143,7 @@ def export_bundle(
     return report
 
 
-def with_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Watch) -> Manifest:
+def with_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Progress) -> Manifest:
     """The manifest, saying how many bytes of activations each training step holds at once."""
     manifest, files = bundle.manifest, dict(bundle.manifest.files)
     steps = {
@@ -234,7 +235,7 @@ def exported_blocks(network: Network, most_layers: int, more: Sequence[Blocks]) 
 
 
 def calibrate_trunk(
-    trainee: Trainee, lessons: Lessons, watch: Watch
+    trainee: Trainee, lessons: Lessons, watch: Progress
 ) -> tuple[Trainee, dict[int, QuantizedLayer]]:
     """A trainee with steps for u8 features, and its layers that can be frozen in int8."""
     ranges = observe_trunk(trainee.net, lessons, SEED, watch)

@@ -1,7 +1,7 @@
 """The input of the first tuned layer: the frozen layers' features, kept or made for every batch."""
 
 import time
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,14 +10,13 @@ import numpy as np
 
 from qsgm.bundle import Bundle
 from qsgm.manifest import COMMAND
+from qsgm.progress import Progress
 from qsgm.runtime import running
 from qsgm.task import Array, Inputs, Lesson, Rows
 from qsgm.tune.plan import Plan
 
 # What the frozen layers leave; where nothing is frozen, the inputs.
 Features = Inputs
-# (stage, how much of it is done, out of how much)
-Progress = Callable[[str, int, int], None]
 # Samples that are in memory at once. With more the frozen layers in float take much of it, and are
 # no quicker. Batches and both sets of samples are whole numbers of slices: whatever a graph makes
 # of a slice's size, a sample's features are the same in all of them.
@@ -101,10 +100,6 @@ def feature_source(
 def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:
     """Around every run of a bundle's graph: they are checked when loaded, not for what they do."""
     return running(f"the bundle {bundle.folder}", f"export it again with `{COMMAND}`")
-
-
-def ignore(_stage: str, _done: int, _of: int) -> None:
-    """Watch nothing."""
 
 
 @contextmanager

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from qsgm.bundle import Bundle
+from qsgm.progress import Progress, ignore
 from qsgm.task import Array, Labelled, Lesson, Rows, Scores
 from qsgm.tune.features import (
     SLICE,
     Features,
     FeatureSource,
-    Progress,
     feature_source,
-    ignore,
     running_graphs,
 )
 from qsgm.tune.plan import Plan

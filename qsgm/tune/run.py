@@ -13,11 +13,12 @@ from typing import Protocol
 import numpy as np
 
 from qsgm.errors import QsgmError
+from qsgm.progress import Progress, ignore
 from qsgm.runtime import run_options
 from qsgm.schedule import steps_per_epoch
 from qsgm.task import Array, Rows
 from qsgm.tune.drift import drift_warnings
-from qsgm.tune.features import Progress, ignore, running_graphs
+from qsgm.tune.features import running_graphs
 from qsgm.tune.loop import StepLoop, run_epochs
 from qsgm.tune.plan import Plan
 from qsgm.tune.prepare import Prepared, validate

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from qsgm import defaults
 from qsgm.files import new_folder
 from qsgm.images import write_png
+from qsgm.progress import Progress
 from qsgm.train.grasp.draw_demo import draw_demo
 from qsgm.train.grasp.objects import OBJECT_KINDS, TABLE_KINDS, DrawnFrame, draw_frame
 
@@ -24,8 +24,6 @@ STREAM = 24001
 JPEG_QUALITY = 92
 CENTER_PX = (320, 240)
 
-# (what is going on, frames done, of how many)
-Watch = Callable[[str, int, int], None]
 
 _README = """# The calibration set
 
@@ -52,7 +50,7 @@ def draw_calibration_set(
     folder: Path,
     count: int = defaults.CALIBRATION_FRAMES,
     seed: int = 0,
-    watch: Watch | None = None,
+    watch: Progress | None = None,
 ) -> None:
     """Draw `count` frames and the two demo pictures into a new folder.
 

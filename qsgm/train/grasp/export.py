@@ -4,19 +4,19 @@ from pathlib import Path
 
 from qsgm.grasp.distractors import FILE as DISTRACTORS
 from qsgm.grasp.task import grasp_task
+from qsgm.progress import Progress
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.export import ExportOptions, export_bundle
 from qsgm.train.export_report import ExportReport
 from qsgm.train.grasp.calibration_set import CalibrationLessons, CalibrationSet
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
-from qsgm.train.quantization.lessons import Watch
 
 
 def fold_and_quantize(
     checkpoint_path: Path,
     calib_folder: Path,
     output_folder: Path,
-    watch: Watch,
+    watch: Progress,
     options: ExportOptions = ExportOptions(),  # noqa: B008 (it is frozen)
 ) -> ExportReport:
     """Export a checkpoint as a bundle.

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from qsgm.grasp.task import GraspTask
+from qsgm.progress import Progress
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.grasp.decision import DecisionConfig, fit_decision
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
 from qsgm.train.grasp.task import DrawnGrasping
 from qsgm.train.model.fold import folded_start
-from qsgm.train.pretraining.pretrain import Learnt, PretrainConfig, Watch, pretrain
+from qsgm.train.pretraining.pretrain import Learnt, PretrainConfig, pretrain
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class DecisionStage:
     def to_json(self) -> dict[str, Any]:
         return {"scenes": asdict(self.scenes), "decision": asdict(self.decision)}
 
-    def __call__(self, learnt: Learnt, seed: int, watch: Watch) -> GraspTask:
+    def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> GraspTask:
         done = 0
 
         def after_episode() -> None:
@@ -46,7 +47,7 @@ def pretrain_grasping(
     output: Path,
     seed: int,
     device: str,
-    watch: Watch,
+    watch: Progress,
     config: PretrainConfig | None = None,
     last_stage: DecisionStage | None = None,
 ) -> Checkpoint:

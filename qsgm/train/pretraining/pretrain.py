@@ -13,7 +13,7 @@ A task may add a last stage of its own. What is done so far is kept beside the o
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
@@ -27,6 +27,7 @@ import qsgm
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
+from qsgm.progress import Progress
 from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.model.fold import folded_start, write_back
@@ -52,9 +53,6 @@ from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
 from qsgm.train.task import DrawnTask
 
 SAVE_EVERY = 100
-
-# stage, steps done, steps in all, figures worth showing
-Watch = Callable[[str, int, int, dict[str, float]], None]
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class LastStage(Protocol):
         """Its sizes, for the card."""
         ...
 
-    def __call__(self, learnt: Learnt, seed: int, watch: Watch) -> Described:
+    def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> Described:
         """The task with what was learnt."""
         ...
 
@@ -102,7 +100,7 @@ def pretrain(
     output: Path,
     seed: int,
     device: str,
-    watch: Watch,
+    watch: Progress,
     config: PretrainConfig | None = None,
     last_stage: LastStage | None = None,
     arguments: str = "",
@@ -157,7 +155,7 @@ def _learn(
     task: DrawnTask,
     config: PretrainConfig,
     seed: int,
-    watch: Watch,
+    watch: Progress,
 ) -> Learnt:
     """Stages 2 to 5; `net` gets its new start."""
     late = len(config.first_rates)
@@ -196,7 +194,12 @@ def _identity(
 
 
 def _backbone(
-    partial: Partial, config: PretrainConfig, task: DrawnTask, seed: int, device: str, watch: Watch
+    partial: Partial,
+    config: PretrainConfig,
+    task: DrawnTask,
+    seed: int,
+    device: str,
+    watch: Progress,
 ) -> ConvNet:
     training = BackboneTraining(config.backbone, task, seed, device)
     if "net" in partial.data:
@@ -226,7 +229,7 @@ def _portable(net: ConvNet) -> ConvNet:
 
 
 def _draw(
-    net: ConvNet, task: DrawnTask, count: int, samples: int, seed: int, watch: Watch, tuned: int
+    net: ConvNet, task: DrawnTask, count: int, samples: int, seed: int, watch: Progress, tuned: int
 ) -> TaskSet:
     done = 0
 
@@ -245,7 +248,7 @@ def _match(
     config: PretrainConfig,
     task: DrawnTask,
     seed: int,
-    watch: Watch,
+    watch: Progress,
 ) -> dict[int, Sgm]:
     torch.manual_seed(seed + 3)
     layers = task.network.last(len(config.first_rates))
@@ -280,7 +283,7 @@ def _meta_train(
     config: PretrainConfig,
     task: DrawnTask,
     seed: int,
-    watch: Watch,
+    watch: Progress,
 ) -> UpdateRule:
     start, rates = folded_start(net, len(config.first_rates)), config.first_rates
     training = MetaTraining(config.maml, task, tasks, start, sgms, rates, seed)
@@ -313,7 +316,7 @@ def _match_early(
     task: DrawnTask,
     config: PretrainConfig,
     seed: int,
-    watch: Watch,
+    watch: Progress,
 ) -> dict[int, Sgm]:
     early, depth = config.early, task.network.depth
     if len(rule.rates) == depth:
@@ -343,7 +346,7 @@ def _choose_rates(
     task: DrawnTask,
     config: PretrainConfig,
     seed: int,
-    watch: Watch,
+    watch: Progress,
 ) -> tuple[dict[str, tuple[float, ...]], float, Score]:
     """Rates for all numbers of layers and blocks, short runs' gain, and the late layers' score."""
     sizes, network, late = config.rates, task.network, len(rule.rates)

@@ -27,7 +27,7 @@ BLOCK_RATE = 3e-3
 
 Rates = tuple[float, ...]
 Start = Sequence[tuple[Tensor, Tensor]]
-Watch = Callable[[Score], None]
+AfterRun = Callable[[Score], None]
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def late_candidates(meta_rates: Rates) -> Iterator[Rates]:
 
 
 def choose_late(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: Watch
+    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: AfterRun
 ) -> tuple[dict[int, Rates], Score]:
     """The best rates for few layers, by their number, and the score of the most.
 
@@ -91,7 +91,7 @@ def choose_late(
 
 
 def choose_short_gain(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: Watch
+    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: AfterRun
 ) -> float:
     """What the rates of a whole run are best multiplied with in a short one."""
     scores: dict[Rates, Score] = {}
@@ -103,7 +103,7 @@ def choose_short_gain(
 
 
 def choose_early(
-    rule: UpdateRule, start: Start, pixels: TaskSet, config: RatesConfig, after_run: Watch
+    rule: UpdateRule, start: Start, pixels: TaskSet, config: RatesConfig, after_run: AfterRun
 ) -> dict[int, Rates]:
     """The best rates for many layers, one more at a time: those behind keep theirs.
 

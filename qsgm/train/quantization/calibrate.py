@@ -17,6 +17,7 @@ import numpy as np
 
 from qsgm.errors import QsgmError
 from qsgm.fidelity import cosine
+from qsgm.progress import Progress
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
@@ -29,7 +30,7 @@ from qsgm.train.quantization.calibration_runs import (
     run,
     run_plans,
 )
-from qsgm.train.quantization.lessons import Lessons, Watch
+from qsgm.train.quantization.lessons import Lessons
 
 # Not a calibrator: for each layer the best of them.
 AUTO = "auto"
@@ -57,7 +58,7 @@ def calibrate(
     trainee: Trainee,
     lessons: Lessons,
     seed: int,
-    watch: Watch,
+    watch: Progress,
     epochs: int = EPOCHS,
     calibrator: str = AUTO,
     activation_bits: ActivationBits = 16,
@@ -117,7 +118,7 @@ def observe(
     trainee: Trainee,
     lessons: Lessons,
     seed: int,
-    watch: Watch,
+    watch: Progress,
     epochs: int,
     held_out: range,
 ) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers]]:
@@ -176,7 +177,7 @@ def judge(
     lessons: Lessons,
     judges: range,
     seed: int,
-    watch: Watch,
+    watch: Progress,
     epochs: int,
 ) -> dict[int, dict[str, float]]:
     """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.

@@ -1,14 +1,10 @@
 """What quantization asks of a calibration set."""
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
 from qsgm.task import Inputs, Lesson
-
-# Of whatever goes through a set: (what is going on, lessons done, of how many)
-Watch = Callable[[str, int, int], None]
 
 
 class Lessons(Protocol):

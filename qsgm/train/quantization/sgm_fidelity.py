@@ -9,6 +9,7 @@ from torch import Tensor
 
 from qsgm.fidelity import Gradients, LayerFidelity, compare, mean_over_run
 from qsgm.network import Network
+from qsgm.progress import Progress
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
 from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
@@ -22,7 +23,7 @@ from qsgm.train.quantization.calibration_runs import (
     passes_of,
     run,
 )
-from qsgm.train.quantization.lessons import Lessons, Watch
+from qsgm.train.quantization.lessons import Lessons
 
 
 def measure(
@@ -30,7 +31,7 @@ def measure(
     int8_sgms: Mapping[int, QuantizedSgm],
     lessons: Lessons,
     seed: int,
-    watch: Watch,
+    watch: Progress,
     epochs: int = EPOCHS,
 ) -> dict[int, LayerFidelity]:
     """Fidelity of each int8 SGM, mean over runs on every frame.

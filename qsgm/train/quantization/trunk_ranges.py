@@ -9,18 +9,19 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from qsgm.progress import Progress
 from qsgm.task import Inputs
 from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.fold import run_folded_layer
 from qsgm.train.model.net import as_seen
-from qsgm.train.quantization.lessons import Lessons, Watch
+from qsgm.train.quantization.lessons import Lessons
 from qsgm.train.quantization.trunk import LayerRange
 
 SAMPLES = 200  # of each lesson
 
 
 def observe_trunk(
-    net: FoldedNet, lessons: Lessons, seed: int, watch: Watch
+    net: FoldedNet, lessons: Lessons, seed: int, watch: Progress
 ) -> dict[int, LayerRange]:
     """Ranges of every layer that can be frozen, 1 to 5, by number.
 
