@@ -103,16 +103,19 @@ def train(
         raise ValueError(f"prepared for layers {prepared.plan.layers}, not for {plan.layers}")
     began = time.perf_counter()
     run = _Run(prepared, plan, observers)
+    started = time.perf_counter()
     losses = run.epochs(watch or ignore)
-    tuning = time.perf_counter() - began
+    tuning = time.perf_counter() - started
     weights = run.loop.weights()
+    scores = validate(prepared, weights)
+    total = prepared.seconds["total"] + time.perf_counter() - began
     return Result(
         prepared,
         plan,
         _in_conv_layout(weights, prepared.bundle.start_weights(plan.layers)),
-        validate(prepared, weights),
+        scores,
         tuple(losses),
-        prepared.seconds | {"tuning": tuning, "total": prepared.seconds["total"] + tuning},
+        prepared.seconds | {"tuning": tuning, "total": total},
     )
 
 
