@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
 from qsgm.fidelity import LayerFidelity
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, constants
-from qsgm.tables import plain_table
+from qsgm.tables import TIGHT, legend, table
 from qsgm.train.quantization.calibrate import EQUAL_COSINE, Calibration
 from qsgm.tune.report import fidelity_json
 
@@ -129,7 +127,10 @@ class ExportReport:
         }
 
     def __rich__(self) -> RenderableType:
-        return Group(table(self), Text(LEGEND + "\n", style="dim"), calibrators(self.calibration))
+        title = f"{self.output}: int8 SGMs, mean over the calibration runs"
+        cells = [layer.cells() for layer in self.layers.values()]
+        layers = table(title, _HEADERS, cells, left=(), padding=TIGHT)
+        return Group(layers, legend(LEGEND + "\n"), calibrators(self.calibration))
 
 
 @dataclass(frozen=True)
@@ -143,28 +144,14 @@ class Provenance:
     calibration_sha256: str  # of the calibration set's manifest
 
 
-def table(report: ExportReport) -> Table:
-    """One row per SGM layer."""
-    result = plain_table(f"{report.output}: int8 SGMs, mean over the calibration runs")
-    result.padding = 0  # the lines between columns are blanks, and 80 columns have to do
-    for header in _HEADERS:
-        result.add_column(Text(header), justify="right", no_wrap=True)  # no markup: [dB]
-    for layer in report.layers.values():
-        result.add_row(*layer.cells())
-    return result
-
-
 def calibrators(calibration: Calibration) -> RenderableType:
     """Whose ranges each SGM has, and why."""
-    why = Text(ranges_from(calibration), style="dim")
+    why = legend(ranges_from(calibration))
     if not judged(calibration):
         return why
-    result = plain_table("cos int8,float of each calibrator's ranges")
-    for header in calibrator_headers(calibration):
-        result.add_column(header, justify="right", no_wrap=True)
-    for row in calibrator_rows(calibration):
-        result.add_row(*row)
-    return Group(result, why)
+    title = "cos int8,float of each calibrator's ranges"
+    rows = calibrator_rows(calibration)
+    return Group(table(title, calibrator_headers(calibration), rows, left=()), why)
 
 
 def judged(calibration: Calibration) -> bool:

@@ -98,16 +98,16 @@ def scores_json(scores: Scores) -> dict[str, float | None]:
     return {name: None if value is None else number(value, 4) for name, value in scores.items()}
 
 
-def fidelity_json(layer: LayerFidelity) -> dict[str, float | None]:
+def fidelity_json(layer: LayerFidelity, digits: int = 5) -> dict[str, float | None]:
     """One SGM layer's metrics."""
-    return {name: number(value, 5) for name, value in asdict(layer).items()}
+    return {name: number(value, digits) for name, value in asdict(layer).items()}
 
 
 def fidelity_over_run_json(result: Result) -> list[dict[str, Any]]:
     """Every probe: its step (0: before the first one), epoch, and its layers' metrics."""
     return [
         {"step": probe.step, "epoch": number(probe.epoch, 5)}
-        | {str(k): fidelity_json(v) for k, v in probe.layers.items()}
+        | {str(k): fidelity_json(v, 7) for k, v in probe.layers.items()}
         for probe in result.probes
     ]
 

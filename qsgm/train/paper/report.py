@@ -11,12 +11,12 @@ from rich.table import Table
 from rich.text import Text
 
 from qsgm.images import write_png
+from qsgm.tables import CLOSE, legend, number, table
 from qsgm.train.paper.experiment import PaperConfig, PaperResults
 from qsgm.train.paper.notes import NOTES
 from qsgm.train.paper.objects import OBJECTS, contact_sheet
 from qsgm.train.paper.published import TABLE_1, TABLE_2, Published, PublishedSystem
 from qsgm.train.paper.systems import ADAM, BATCHNORM, sgd_variant
-from qsgm.tune.report import number, plain_table
 
 METRICS = {"detection": 1, "angle": 2}  # and where it stands in a score
 _FORMS = {"detection": "{:.2f}", "angle": "{:.1f}"}
@@ -82,7 +82,7 @@ def render(results: PaperResults) -> RenderableType:
     ]
     for title, published in (("Table 1", TABLE_1), ("Table 2, two layers", TABLE_2)):
         parts += [_table(results, title, published, metric) for metric in METRICS]
-    parts += [_others_table(results), Text(_LEGEND, style="dim")]
+    parts += [_others_table(results), legend(_LEGEND)]
     return Group(*parts, *(Text(f"- {note}") for note in NOTES))
 
 
@@ -97,22 +97,25 @@ _LEGEND = (
 def _table(
     results: PaperResults, title: str, published: Mapping[str, PublishedSystem], metric: str
 ) -> Table:
-    table = plain_table(f"{title}: {_TITLES[metric]}")
-    table.padding, table.pad_edge = (0, 1, 0, 0), False
-    for column in ("", ""):
-        table.add_column(column, no_wrap=True)
-    for column in (*results.letters, "avg", "std"):
-        table.add_column(column, justify="right", no_wrap=True)
+    cells: list[Sequence[object]] = []
     for name, figures in published.items():
-        table.add_section()
         rows = _rows(results, _SYSTEM_OF.get(name, name), metric)
-        for title_cell, (label, cells) in zip([name, *[""] * len(rows)], rows, strict=False):
-            table.add_row(title_cell, label, *cells)
-        table.add_row("", Text("paper", style="dim"), *_paper_cells(results, figures, metric))
-    return table
+        titles = [name, *[""] * len(rows)]
+        cells += [[], *([head, *row] for head, row in zip(titles, rows, strict=False))]
+        cells.append(["", legend("paper"), *_paper_cells(results, figures, metric)])
+    headings = ["", "", *results.letters, "avg", "std"]
+    return _table_of(f"{title}: {_TITLES[metric]}", headings, cells, left=(0, 1))
 
 
-def _rows(results: PaperResults, system: str, metric: str) -> list[tuple[str, list[str]]]:
+def _table_of(
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[object]], left: Sequence[int]
+) -> Table:
+    made = table(title, headings, rows, left, CLOSE)
+    made.pad_edge = False
+    return made
+
+
+def _rows(results: PaperResults, system: str, metric: str) -> list[list[str]]:
     """How a system was run, and its cells: the paper's rate, the best one, batchnorm kept."""
     first, best = sgd_variant(results.config.rates[0]), best_variant(results, system)
     labels = {ADAM: ADAM, first: first} | ({best: best} if best else {})
@@ -121,34 +124,27 @@ def _rows(results: PaperResults, system: str, metric: str) -> list[tuple[str, li
         values = values_of(results, system, variant, metric)
         if values is not None:
             cells = _cells([*values, *_statistics(values)], _FORMS[metric].format)
-            rows.append((label, cells))
+            rows.append([label, *cells])
     return rows
 
 
 def _paper_cells(results: PaperResults, figures: PublishedSystem, metric: str) -> list[Text]:
     published: Published = getattr(figures, metric)
     values = [*published.values[: len(results.letters)], published.average, published.spread]
-    return [Text(_FORMS[metric].format(value), style="dim") for value in values]
+    return [legend(_FORMS[metric].format(value)) for value in values]
 
 
 def _others_table(results: PaperResults) -> Table:
-    table = plain_table(
-        f"three layers, other systems: averages over {len(results.letters)} objects"
-    )
-    table.padding, table.pad_edge = (0, 1, 0, 0), False
-    table.add_column("", no_wrap=True)
-    for how in ("SGD 0.1", "best", "BN"):
-        table.add_column(f"{how}\ndet.", justify="right")
-        table.add_column("\nangle", justify="right")
-    table.add_column("best\nrate", justify="right")
-    table.add_column("in the\npaper", no_wrap=True)
+    rows = []
     for system, said in OTHERS.items():
         best = best_variant(results, system) or ADAM
         variants = (sgd_variant(results.config.rates[0]), best, BATCHNORM)
         cells = [cell for variant in variants for cell in _averages(results, system, variant)]
         rate = best.removeprefix("SGD ") if values_of(results, system, best, "angle") else "none"
-        table.add_row(system, *cells, rate.replace(ADAM, "Adam"), said)
-    return table
+        rows.append([system, *cells, rate.replace(ADAM, "Adam"), said])
+    pairs = [text for how in ("SGD 0.1", "best", "BN") for text in (f"{how}\ndet.", "\nangle")]
+    title = f"three layers, other systems: averages over {len(results.letters)} objects"
+    return _table_of(title, ["", *pairs, "best\nrate", "in the\npaper"], rows, left=(0, 8))
 
 
 def _averages(results: PaperResults, system: str, variant: str) -> list[str]:
@@ -181,8 +177,8 @@ def to_json(results: PaperResults) -> dict[str, Any]:
         "config": asdict(results.config),
         "objects": {letter: asdict(OBJECTS[letter]) for letter in results.letters},
         "paper": {
-            title: {name: asdict(row) for name, row in table.items()}
-            for title, table in (("table_1", TABLE_1), ("table_2", TABLE_2))
+            title: {name: asdict(row) for name, row in rows.items()}
+            for title, rows in (("table_1", TABLE_1), ("table_2", TABLE_2))
         },
         "systems": {
             system: {
