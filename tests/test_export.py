@@ -26,11 +26,11 @@ from qsgm.train import export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.export_report import ExportReport
 from qsgm.train.graphs.inspection import refuse_float_products
+from qsgm.train.graphs.memory import step_memory
 from qsgm.train.grasp.calibration_set import CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.grasp.export import fold_and_quantize
-from qsgm.train.liveness import step_memory
 from qsgm.train.model.fold import fold_net
 from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm

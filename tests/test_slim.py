@@ -14,13 +14,13 @@ from toys import by_correlation
 
 from qsgm import QsgmError, Settings, finetune, load_bundle
 from qsgm.bench.speed import measure_speed
-from qsgm.bench.step_jobs import random_features, start_of
 from qsgm.blocks import one_block, parse_blocks, single_layers
 from qsgm.bundle import Bundle
 from qsgm.manifest import probe_file, step_file
 from qsgm.train.graphs.inspection import all_nodes
-from qsgm.train.liveness import step_memory
+from qsgm.train.graphs.memory import step_memory
 from qsgm.train.slim import slim_bundle
+from qsgm.tune.noop_step import random_features, start_of
 
 Frame = NDArray[np.uint8]
 

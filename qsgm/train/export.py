@@ -43,6 +43,7 @@ from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
 from qsgm.train.graphs.inspection import refuse_float_products
+from qsgm.train.graphs.memory import graph_memory
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.probe import head_model, probe_model
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
@@ -54,7 +55,6 @@ from qsgm.train.graphs.trunk import (
     trunk_model,
 )
 from qsgm.train.heads import activate
-from qsgm.train.liveness import graph_memory
 from qsgm.train.model.arrays import FLAT_ARRAYS, FoldedNet
 from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.model.net import as_seen

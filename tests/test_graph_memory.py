@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.bundle import Bundle
+from qsgm.grasp.network import GRASPNET
 from qsgm.train.graphs.build import Graph
-from qsgm.train.liveness import Run, live_peak, size_of, step_memory, traced
+from qsgm.train.graphs.memory import Run, live_peak, size_of, step_memory, traced
 
 # The runtime also allocates the loss, and may keep a small tensor for one that comes later.
 SLACK_BYTES, SLACK = 256, 0.01
@@ -144,9 +145,9 @@ def test_a_steps_peak_is_what_the_runtime_asks_for_in_its_first_step(
     bundle: Bundle, tuned: int, batch: int
 ) -> None:
     for precision, blocks in (
-        ("int8", single_layers(tuned)),
-        ("float", single_layers(tuned)),
-        ("float", one_block(tuned)),
+        ("int8", single_layers(GRASPNET.last(tuned))),
+        ("float", single_layers(GRASPNET.last(tuned))),
+        ("float", one_block(GRASPNET.last(tuned))),
     ):
         step = step_memory(bundle, precision, blocks, batch)
         if step.first_step is None:
@@ -165,8 +166,8 @@ def layers_at(alive: dict[str, int]) -> set[str]:
 def test_with_sgms_one_layer_is_alive_at_the_peak_and_with_backpropagation_several(
     bundle: Bundle,
 ) -> None:
-    sgm = step_memory(bundle, "int8", single_layers(6), 4)
-    bp = step_memory(bundle, "float", one_block(6), 4)
+    sgm = step_memory(bundle, "int8", single_layers(GRASPNET.last(6)), 4)
+    bp = step_memory(bundle, "float", one_block(GRASPNET.last(6)), 4)
     assert layers_at(dict(sgm.alive)) == {"layer1", "batch"}  # and the crops it reads
     assert layers_at(dict(bp.alive)) >= {"layer1", "layer2", "layer3"}
 
@@ -174,7 +175,7 @@ def test_with_sgms_one_layer_is_alive_at_the_peak_and_with_backpropagation_sever
 def test_the_sgms_peak_of_all_six_layers_is_a_quarter_of_backpropagations_at_most(
     bundle: Bundle,
 ) -> None:
-    most = step_memory(bundle, "float", one_block(6), 32).peak / 4
+    most = step_memory(bundle, "float", one_block(GRASPNET.last(6)), 32).peak / 4
     for precision, text in (("int8", "1,2,3,4,5,6"), ("float", "1,2,3,4,5,6"), ("int8", "1-4,5,6")):
         assert step_memory(bundle, precision, parse_blocks(text), 32).peak < most
 
@@ -184,5 +185,5 @@ def test_a_peak_grows_with_the_batch_but_where_layers_go_crop_by_crop(bundle: Bu
         few, many = (step_memory(bundle, "float", blocks, batch).peak for batch in (4, 8))
         return many / few
 
-    assert growth(one_block(5)) == pytest.approx(2, rel=0.02)
-    assert growth(single_layers(5)) < 1.5
+    assert growth(one_block(GRASPNET.last(5))) == pytest.approx(2, rel=0.02)
+    assert growth(single_layers(GRASPNET.last(5))) < 1.5

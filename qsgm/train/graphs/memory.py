@@ -32,8 +32,7 @@ from qsgm.manifest import Precision, step_file
 from qsgm.runtime import session_options
 from qsgm.train.graphs.inspection import all_nodes, bodies
 from qsgm.tune.features import running_graphs
-from qsgm.tune.loop import StepLoop
-from qsgm.tune.prepare import in_step_layout
+from qsgm.tune.noop_step import noop_step, start_of
 
 # Their result is their first input under another shape.
 VIEWS = frozenset({"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"})
@@ -111,9 +110,7 @@ def graph_memory(
     def two_steps(session: ort.InferenceSession) -> None:
         # In the first one memory is asked for piece by piece, from then on in one block.
         with running_graphs(bundle):
-            step = still_loop(
-                session, in_step_layout(bundle.start_weights(blocks.layers)), blocks, batch
-            )
+            step = noop_step(session, start_of(bundle, blocks.layers), blocks, batch)
             step()
             step()
 
@@ -271,24 +268,3 @@ def shares(run: Run, source: Tensor, moment: int, size: int) -> bool:
     """Whether a node's result of this size lies in the memory of its first input."""
     over = run.op_type in IN_PLACE and source.last == moment and source.bytes == size
     return over or run.op_type in VIEWS
-
-
-def still_loop(
-    session: Any, start: Mapping[str, Any], blocks: Blocks, batch: int
-) -> Callable[[], float]:
-    """A step on so many samples that changes no weight."""
-    inputs = {value.name: value for value in session.get_inputs()}
-    labels = np.zeros((batch, inputs["labels"].shape[1]), np.float32)
-    rates = dict.fromkeys(blocks.layers, 0.0)
-    loop = StepLoop(session, random_features(session, batch), labels, start, rates)
-    rows = np.arange(batch)
-    return lambda: loop.step(rows)
-
-
-def random_features(session: Any, samples: int) -> Any:
-    """What a graph's input `features` takes, of so many samples: pixels or codes, or floats."""
-    (features,) = (value for value in session.get_inputs() if value.name == "features")
-    shape, rng = (samples, *features.shape[1:]), np.random.default_rng(0)
-    if "uint8" in features.type:
-        return rng.integers(0, 256, shape, np.uint8)
-    return rng.uniform(0, 1, shape).astype(np.float32)
