@@ -18,7 +18,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,11 @@ from rich.table import Table
 
 from qsgm import QsgmError, Settings, load_bundle
 from qsgm.bundle import Bundle
+from qsgm.grasp.source import Demonstration
+from qsgm.grasp.teach import prepare_object, train_object
 from qsgm.grasp.tuned import TunedObject
 from qsgm.images import read_frame
-from qsgm.tune.prepare import prepare
-from qsgm.tune.run import train
+from qsgm.tune.plan import resolve
 
 RIGHT_SHARE = 0.27
 FALSE_ALARMS = 0.02
@@ -68,9 +69,9 @@ def answers_of(job: Job, number: int) -> Iterator[Answer]:
     one, folder, bundle = job.objects[number], job.folder, job.bundle
     first, *more = one["photos"]
     x, y = map(float, first["center_px"])
-    settings = replace(job.settings, center_px=(x, y))
-    prepared = prepare(read_frame(folder / first["file"]), bundle, settings)
-    taught = train(prepared, settings, probe=False).tuned_object(one["object"])
+    plan = resolve(job.settings, bundle)
+    shown = [Demonstration(read_frame(folder / first["file"]), (x, y))]
+    taught = train_object(prepare_object(shown, bundle, plan), plan).tuned_object(one["object"])
     for photo in more:
         yield _answer(job, taught, photo)
     for file in _without(job, number):

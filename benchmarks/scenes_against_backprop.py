@@ -22,7 +22,8 @@ from qsgm.bench.frames import list_frames
 from qsgm.bench.judging import Tally, paired_difference
 from qsgm.bench.scenes import MethodResults, ScenePlan, TunedMethod, measure_scenes
 from qsgm.bench.subjects import drawn_subjects, spread, subjects_of
-from qsgm.bundle import Bundle, Recipe, load_bundle
+from qsgm.bundle import Bundle, load_bundle
+from qsgm.manifest import Recipe
 from qsgm.tune.settings import Settings
 
 LENGTHS = (1, 3, 20)

@@ -3,7 +3,8 @@
 import io
 import json
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,17 +15,28 @@ import pytest
 from rich.console import Console
 
 from qsgm import QsgmError, cli
-from qsgm.bench import accuracy, speed
-from qsgm.bench.accuracy import ANGLE, AccuracyReport, curve_steps, measure_accuracy
-from qsgm.bench.accuracy_report import accuracy_report_json, render, statistics
+from qsgm.bench import accuracy, speed, timing
+from qsgm.bench.accuracy import (
+    ANGLE,
+    METRICS,
+    AccuracyReport,
+    curve_steps,
+    measure_accuracy,
+    render,
+    report_json,
+    statistics,
+)
 from qsgm.bench.frames import BenchFrame, list_frames
 from qsgm.bench.speed import measure_speed, ratios
 from qsgm.blocks import single_layers
-from qsgm.bundle import Bundle, Recipe, load_bundle, step_file
+from qsgm.bundle import Bundle
+from qsgm.grasp.teach import finetune, prepare_object
 from qsgm.images import write_png
-from qsgm.tune.loop import StepLoop, batches
-from qsgm.tune.prepare import prepare
-from qsgm.tune.run import finetune, train
+from qsgm.manifest import Recipe, step_file
+from qsgm.schedule import batches
+from qsgm.tune.loop import StepLoop
+from qsgm.tune.plan import resolve
+from qsgm.tune.run import Keeper, train
 from qsgm.tune.settings import Settings
 
 SHORT = Settings(epochs=1)
@@ -120,26 +132,28 @@ def test_a_learning_curve_goes_from_the_untouched_network_to_what_finetune_gives
     for runs in accuracy_report.runs:
         alone = finetune(frame, bundle, replace(MAIN, epochs=runs.epochs, **changes))
         curve = runs.methods[name][0]
-        assert tuple(curve[0]) == astuple(alone.zero_shot)[:2]
-        assert tuple(curve[-1]) == astuple(alone.accuracy)[:2]
+        for place, scores in ((0, alone.untouched), (-1, alone.scores)):
+            assert list(curve[place]) == [scores[metric] for metric in METRICS]
         np.testing.assert_array_equal(runs.methods["untouched"][0], curve[:1].repeat(len(curve), 0))
 
 
 def test_weights_on_the_way_are_those_of_a_run_cut_short_there(
     frame_path: Path, bundle: Bundle
 ) -> None:
-    prepared = prepare(BenchFrame(frame_path, None, None).read(), bundle, MAIN)
     recipe = Recipe("sgd", (0.003, 0.004, 0.005))
-    result = train(prepared, MAIN, recipe=recipe, keep=(0, 7))
-    session = bundle.session(step_file("int8", "sgd", single_layers(3)))
+    plan = resolve(MAIN, bundle, recipe)
+    prepared = prepare_object(BenchFrame(frame_path, None, None).read(), bundle, plan)
+    keeper = Keeper((0, 7))
+    train(prepared, plan, (keeper,))
+    session = bundle.session(step_file("int8", "sgd", single_layers(plan.layers)))
     rates = dict(zip((4, 5, 6), recipe.rates, strict=True))
     loop = StepLoop(session, prepared.features, prepared.labels, prepared.start, rates)
     for step, rows in enumerate(islice(batches(800, np.random.default_rng([0, 1])), 7)):
         loop.step(rows, 1 - step / 50)
-    assert set(result.kept) == {0, 7}
+    assert set(keeper.kept) == {0, 7}
     for name, value in loop.weights().items():
-        np.testing.assert_array_equal(result.kept[7][name], value)
-        np.testing.assert_array_equal(result.kept[0][name], prepared.start[name])
+        np.testing.assert_array_equal(keeper.kept[7][name], value)
+        np.testing.assert_array_equal(keeper.kept[0][name], prepared.start[name])
 
 
 def test_a_run_is_looked_at_twice_a_doubling_and_at_both_ends() -> None:
@@ -164,7 +178,7 @@ def test_rates_that_blow_up_are_reported_and_never_the_best(
     for runs, errors in zip(accuracy_report.runs, ends_of(accuracy_report), strict=True):
         assert math.isnan(errors[Recipe("sgd", (1e12,) * 3)])
         assert runs.best.rates[0] < 1
-    grid = accuracy_report_json(accuracy_report)["runs"][0]["grid"]
+    grid = report_json(accuracy_report)["runs"][0]["grid"]
     assert [(entry["optimizer"], entry["rate"]) for entry in grid] == [
         *(("adam", rate) for rate in (0.001, 0.003)),
         *(("sgd", rate) for rate in (0.01, 1e12)),
@@ -174,7 +188,7 @@ def test_rates_that_blow_up_are_reported_and_never_the_best(
 
 
 def test_the_accuracy_report_adds_up(accuracy_report: AccuracyReport) -> None:
-    values = accuracy_report_json(accuracy_report)
+    values = report_json(accuracy_report)
     json.dumps(values, allow_nan=False)
     assert (values["all"]["frames"], values["elongated"]["frames"]) == (2, 1)
     main = values["runs"][-1]
@@ -199,7 +213,7 @@ def test_the_tables_of_the_defaults_fit_into_80_columns(accuracy_report: Accurac
     one, main = accuracy_report.runs
     lengths = (one, replace(one, epochs=3), replace(main, epochs=20))
     console = Console(width=200, record=True, file=io.StringIO())
-    console.print(render(replace(accuracy_report, runs=lengths), per_frame=True))
+    console.print(render(report_json(replace(accuracy_report, runs=lengths)), per_frame=True))
     lines = [line.rstrip() for line in console.export_text().splitlines()]
     assert max(map(len, lines)) <= 80
     rows = [line.split() for line in lines if line.startswith(" sgm int8")]
@@ -266,10 +280,53 @@ def test_speed_runs_the_same_job_in_processes_of_their_own(
     assert set(report["seconds"]) >= {"sgm int8", "sgm float", "bp"}
     assert report["steps"] == 25
     assert report["ratios"]["torch_bp_step_over_qsgm_step"] > 0
-    # No peer was asked for; own steps are there all the same.
     assert report["step_table_ms"] == {"1": report["in_turns_ms"]}
-    assert report["peers"] == {"1": {}}
-    assert report["not_measured"] == {}
+    assert report["step_over_qsgm_step"]["1"]["sgm_float"] == 1
+
+
+def test_single_steps_are_timed_with_further_numbers_of_threads(
+    frames_folder: Path,
+    bundle_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stages = dict.fromkeys(("crops", "features", "tuning", "total", "process"), 1.0)
+    monkeypatch.setattr(speed, "run_once", lambda *_: stages)
+    monkeypatch.setattr(speed, "TURNS", 2)
+    command = ["bench", "speed", "--frames", str(frames_folder), "--bundle", str(bundle_folder)]
+    command += ["--thread-counts", "1,2", "--repeats", "1"]
+    assert cli.run([*command, "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["step_table_ms"]) == ["1", "2"]
+    assert cli.run(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any("threads: 2" in line for line in lines)
+
+
+@pytest.mark.parametrize("counts", ["0", "1;2"])
+def test_thread_counts_that_are_none_are_refused(
+    counts: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["bench", "speed", "--thread-counts", counts]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "--thread-counts" in message
+
+
+def test_variants_take_turns_and_the_first_turn_does_not_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[str] = []
+    clock = [0.0]
+
+    def job(name: str, seconds: list[float]) -> None:
+        clock[0] += seconds[calls.count(name)]
+        calls.append(name)
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+    jobs = {"a": partial(job, "a", [900, 1, 5, 2]), "b": partial(job, "b", [0, 7, 8, 9])}
+    assert timing.median_seconds(jobs, 3) == {"a": 2, "b": 8}
+    assert calls == ["a", "b"] * 4
 
 
 def test_speed_hands_its_settings_to_every_process(
@@ -298,13 +355,13 @@ def test_speed_names_the_variant_that_failed(bundle: Bundle, tmp_path: Path) -> 
 def test_the_torch_job_learns_what_backpropagation_here_learns(
     frame_path: Path, bundle: Bundle
 ) -> None:
-    from qsgm.train import torchjob
+    from qsgm.train.grasp import torch_job
 
     settings = Settings(method="bp", layers=2, epochs=2)
     own = finetune(BenchFrame(frame_path, None, None).read(), bundle, settings)
-    other = torchjob.run(frame_path, bundle, 2, 2, 0, 1)
-    assert other["detection_accuracy"] == pytest.approx(own.accuracy.detection_accuracy, abs=0.006)
-    assert other["angle_mae_deg"] == pytest.approx(own.accuracy.angle_mae_deg, abs=0.1)
+    other = torch_job.run(frame_path, bundle, 2, 2, 0, 1)
+    assert other["detection_accuracy"] == pytest.approx(own.scores["detection_accuracy"], abs=0.006)
+    assert other["angle_mae_deg"] == pytest.approx(own.scores["angle_mae_deg"], abs=0.1)
 
 
 def test_a_frame_that_cannot_serve_as_a_demonstration_is_refused(tmp_path: Path) -> None:
@@ -315,35 +372,3 @@ def test_a_frame_that_cannot_serve_as_a_demonstration_is_refused(tmp_path: Path)
         flat.read()
     with pytest.raises(QsgmError, match="too small for a demonstration"):
         small.read()
-
-
-def test_layers_are_compared_on_every_frame_division_by_division(
-    bundle_folder: Path, frames_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["bench", "layers", "--frames", str(frames_folder), "--bundle", str(bundle_folder)]
-    arguments += ["--epochs", "1", "--blocks", "4,5,6", "--blocks", "4,5-6"]
-    assert cli.run([*arguments, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert list(report["blocks"]) == ["4,5,6", "4,5-6"]
-    for row in report["blocks"].values():
-        assert len(row["per_frame"]) == len(report["frames"])
-        mean = np.mean(row["per_frame"], axis=0)
-        assert row["all"]["detection_accuracy"] == pytest.approx(mean[0], abs=1e-3)
-        assert row["all"]["angle_mae_deg"] == pytest.approx(mean[1], abs=1e-3)
-    same = finetune(
-        list_frames(frames_folder)[0].read(),
-        load_bundle(bundle_folder),
-        Settings(layers=3, blocks="4,5-6", epochs=1),
-    )
-    angle = report["blocks"]["4,5-6"]["per_frame"][0][1]
-    assert angle == pytest.approx(same.accuracy.angle_mae_deg, abs=1e-3)
-    assert cli.run(arguments) == 0
-    assert "4,5-6" in capsys.readouterr().out
-
-
-def test_blocks_that_a_bundle_lacks_are_refused_before_anything_is_measured(
-    bundle_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["bench", "layers", "--bundle", str(bundle_folder), "--blocks", "3-5,6"]
-    assert cli.run(arguments) == 1
-    assert "has no step for the blocks 3-5,6" in capsys.readouterr().err

@@ -27,21 +27,23 @@ from qsgm.bench.calibration import (
     Variant,
     calibration_sets,
     darkened,
-    exchange,
+    exchanged,
     measure_calibration,
     observe_run,
     parse_variant,
     ranges_seen,
+    render,
 )
 from qsgm.bench.frames import BenchFrame, list_frames
-from qsgm.bundle import Bundle, load_bundle
+from qsgm.bundle import Bundle
 from qsgm.grasp.crops import TRAIN_CROPS
+from qsgm.grasp.teach import prepare_object
 from qsgm.sgm.float import float_trace
 from qsgm.sgm.int8 import integer_forward, quantize_sgm
-from qsgm.train.calibration_chart import write_calibration_chart
-from qsgm.tune.prepare import Prepared, prepare
+from qsgm.tune.plan import Plan, resolve
+from qsgm.tune.prepare import Prepared
 from qsgm.tune.probe import activations_of, open_probe
-from qsgm.tune.run import train
+from qsgm.tune.run import Keeper, train, tune
 from qsgm.tune.settings import Settings
 from tests.conftest import draw_frame
 
@@ -79,7 +81,12 @@ def test_ranges_of_the_very_object_leave_16_bits_nothing_to_clip(report: Calibra
 
 @pytest.fixture(scope="module")
 def prepared(bundle: Bundle) -> Prepared:
-    return prepare(draw_frame()[0], bundle, SHORT)
+    return prepare_object(draw_frame()[0], bundle, resolve(SHORT, bundle))
+
+
+@pytest.fixture(scope="module")
+def plan(bundle: Bundle) -> Plan:
+    return resolve(SHORT, bundle)
 
 
 def with_labels(activation: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -88,15 +95,18 @@ def with_labels(activation: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def test_a_run_is_observed_from_its_first_step_to_its_last(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibration, "OBSERVED_CROPS", TRAIN_CROPS)
-    ranges_of_run = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
+    floating = replace(plan, precision="float")
+    ranges_of_run = ranges_seen(observe_run(prepared, floating), prepared.bundle)
     # By hand: all crops before the first of the epoch's 25 steps, and after the last.
-    floating = replace(SHORT, precision="float")
-    kept = train(prepared, floating, probe=False, keep=(0, 25)).kept
-    probe, rows = open_probe(prepared, SHORT), np.arange(TRAIN_CROPS)
-    before, after = (activations_of(probe, prepared, SHORT, kept[step], rows) for step in (0, 25))
+    keeper = Keeper((0, 25))
+    train(prepared, floating, (keeper,))
+    probe, rows = open_probe(prepared.bundle, plan), np.arange(TRAIN_CROPS)
+    before, after = (
+        activations_of(probe, prepared, plan, keeper.kept[step], rows) for step in (0, 25)
+    )
     for layer in (4, 5):
         ranges = ranges_of_run(layer, TWO[0])
         ends = np.array([before[layer].max(axis=(0, 1)), after[layer].max(axis=(0, 1))])
@@ -116,11 +126,11 @@ def test_a_run_is_observed_from_its_first_step_to_its_last(
     "variant", [Variant(8, 4, "mse"), Variant(8, 16, "minmax"), TWO[0]], ids=str
 )
 def test_an_exchanged_variant_gives_what_a_bundle_calibrated_so_would_give(
-    prepared: Prepared, variant: Variant
+    prepared: Prepared, plan: Plan, variant: Variant
 ) -> None:
-    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
-    exchanged = exchange(prepared, SHORT, ranges, variant)
-    probe, rows = open_probe(prepared, SHORT, exchanged), np.arange(32)
+    ranges = ranges_seen(observe_run(prepared, replace(plan, precision="float")), prepared.bundle)
+    changed = exchanged(prepared.bundle, plan, ranges, variant)
+    probe, rows = open_probe(prepared.bundle, changed), np.arange(32)
     feeds = {"features": prepared.features, "labels": prepared.labels, **prepared.start}
     for layer in (4, 5):
         names = [f"activation{layer}", f"int8{layer}"]
@@ -131,10 +141,12 @@ def test_an_exchanged_variant_gives_what_a_bundle_calibrated_so_would_give(
         np.testing.assert_array_equal(int8, integer_forward(q, seen)[0])
 
 
-def test_a_run_is_driven_and_judged_with_the_exchanged_variant(prepared: Prepared) -> None:
-    ranges = ranges_seen(observe_run(prepared, SHORT, (4, 5)))
+def test_a_run_is_driven_and_judged_with_the_exchanged_variant(
+    prepared: Prepared, plan: Plan
+) -> None:
+    ranges = ranges_seen(observe_run(prepared, replace(plan, precision="float")), prepared.bundle)
     coarse, fine = (
-        train(prepared, SHORT, exchanged=exchange(prepared, SHORT, ranges, variant))
+        tune(prepared, exchanged(prepared.bundle, plan, ranges, variant))
         for variant in (Variant(8, 4, "mse"), TWO[0])
     )
     for layer in (4, 5):
@@ -194,8 +206,9 @@ def test_plain_tables_are_those_that_the_manifest_calls_so(tmp_path: Path) -> No
 
 
 def test_a_bundle_of_8_bit_activations_is_refused(bundle_folder: Path, bundle: Bundle) -> None:
-    loaded = load_bundle(bundle_folder)
-    loaded.manifest["sgms"]["5"]["bits"] = 8
+    sgms = dict(bundle.manifest.sgms)
+    sgms[5] = replace(sgms[5], bits=8)
+    loaded = replace(bundle, manifest=replace(bundle.manifest, sgms=sgms))
     with pytest.raises(QsgmError, match="8 bit activations, expected 16"):
         measure_calibration([], bundle_folder, loaded, SHORT, lambda *_: None)
     assert bundle.activation_bits(5) == 16
@@ -205,7 +218,7 @@ def test_the_tables_fit_into_80_columns(report: CalibrationReport) -> None:
     texts = []
     for width in (80, 200):
         console = Console(width=width, record=True, file=io.StringIO())
-        console.print(report.render())
+        console.print(render(report.to_json()))
         texts.append([line.rstrip() for line in console.export_text().splitlines()])
     narrow, wide = texts
     rules = [line for line in narrow if "──" in line]
@@ -220,14 +233,6 @@ def test_the_json_holds_every_run(report: CalibrationReport) -> None:
     row = values["sources"][OWN_RUN][str(TWO[0])]
     assert len(row["per_frame"]) == 2
     assert row["cos_int8_float"] > 0.999
-
-
-def test_the_study_is_drawn(report: CalibrationReport, tmp_path: Path) -> None:
-    write_calibration_chart(report, tmp_path / "study.png")
-    picture = cv2.imread(str(tmp_path / "study.png"))
-    assert picture is not None
-    assert picture.shape[1] == 1800
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
 def test_a_folder_without_frames_is_refused_before_any_work(

@@ -27,7 +27,6 @@ from qsgm.bench.judging import (
     Judged,
     Tally,
     Truth,
-    difference_of_reports,
     equal_error_rate,
     errors,
     intervals,
@@ -40,7 +39,7 @@ from qsgm.bench.judging import (
 from qsgm.bench.rivals import Rival, keep_scenes, parse_rival, write_subject
 from qsgm.bench.scenes import MethodResults, ScenePlan, measure_scenes
 from qsgm.bench.scenes_picture import Album, draw_scenes
-from qsgm.bench.scenes_report import ScenesReport
+from qsgm.bench.scenes_report import render, report_json
 from qsgm.bench.subjects import drawn_subjects, subjects_of
 from qsgm.cli.bench import SceneCondition
 from qsgm.tune.settings import Settings
@@ -188,22 +187,6 @@ def test_differences_are_paired_by_scene() -> None:
         paired_difference(first, second[:5], seed=0)
 
 
-def test_reports_are_compared_on_the_scenes_that_both_have() -> None:
-    def scene(number: int, outcome: str, at: float = 1.0) -> dict[str, Any]:
-        return {
-            "frame": "bar",
-            "condition": "beside",
-            "number": number,
-            "present": True,
-            "true_center_px": [at, 2.0],
-            "outcome": outcome,
-        }
-
-    mine = {"per_scene": [scene(0, "right_place"), scene(1, "missed"), scene(2, "right_place")]}
-    theirs = {"per_scene": [scene(1, "missed"), scene(0, "missed"), scene(2, "missed", at=9.0)]}
-    assert difference_of_reports(mine, theirs)[0] == 0.5
-
-
 def test_only_elongated_objects_count_for_turns_and_unique_ones_for_the_way_round() -> None:
     hit = judged()
     round_one = replace(hit, truth=replace(hit.truth, elongated=False, unique=False, turn_deg=90))
@@ -248,18 +231,18 @@ def plan(frames_folder: Path) -> ScenePlan:
 
 
 @pytest.fixture(scope="module")
-def report(plan: ScenePlan) -> tuple[ScenesReport, Album]:
+def report(plan: ScenePlan) -> tuple[dict[str, Any], Album]:
     album = Album(tuple(subject.name for subject in plan.subjects))
     told: list[tuple[str, int, int]] = []
     methods = [Knowing(plan), Knowing(plan, "alarming", alarms=1)]
     results = measure_scenes(plan, methods, lambda *what: told.append(what), album.look)
     assert told == [("frames", 1, 2), ("frames", 2, 2)]
-    return ScenesReport(plan, Settings(), Path("export"), "drawn", tuple(results)), album
+    return report_json(plan, Settings(), Path("export"), "drawn", results), album
 
 
 @pytest.fixture(scope="module")
-def values(report: tuple[ScenesReport, Album]) -> dict[str, Any]:
-    return report[0].to_json()
+def values(report: tuple[dict[str, Any], Album]) -> dict[str, Any]:
+    return report[0]
 
 
 def test_who_knows_the_truth_is_right_everywhere(values: dict[str, Any]) -> None:
@@ -283,10 +266,10 @@ def test_at_equal_false_alarms_who_is_sure_of_what_is_not_there_finds_nothing(
 
 
 def test_the_tables_fit_80_columns(
-    report: tuple[ScenesReport, Album], values: dict[str, Any]
+    values: dict[str, Any],
 ) -> None:
     console = Console(width=80, file=io.StringIO(), record=True)
-    console.print(report[0].render(values))
+    console.print(render(values))
     text = console.export_text()
     assert "same table" in text
     assert "pooled" in text
@@ -295,7 +278,7 @@ def test_the_tables_fit_80_columns(
 
 
 def test_the_picture_shows_a_row_for_every_condition(
-    report: tuple[ScenesReport, Album], values: dict[str, Any], plan: ScenePlan
+    report: tuple[dict[str, Any], Album], values: dict[str, Any], plan: ScenePlan
 ) -> None:
     album = report[1]
     picture = draw_scenes(values, album)

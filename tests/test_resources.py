@@ -4,6 +4,7 @@ import io
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,35 +14,38 @@ from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 from qsgm import cli
-from qsgm.bench.paper_table import PUBLISHED, as_printed, counted_row
 from qsgm.bench.resources import (
+    PUBLISHED,
     Cost,
-    ResourcesReport,
+    as_printed,
     cost_of,
+    counted_row,
     int8_bytes,
     measure_resources,
-    step_cost,
+    output_bytes,
+    render,
+    step_macs,
 )
-from qsgm.bench.shapes import STRIDES, layer_shapes, output_bytes
-from qsgm.bench.step_jobs import step_job
-from qsgm.blocks import parse_blocks, single_layers
+from qsgm.bench.timing import step_job
+from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle
+from qsgm.grasp.network import GRASPNET
+from qsgm.schedule import BATCH
 from qsgm.sgm.float import FoldedConv, FoldedSgm, float_trace
 from qsgm.sgm.int8 import ActivationBits, SgmRanges, constants, quantize_sgm
-from qsgm.train.model import graspnet
 from qsgm.train.model.fold import run_folded_sgm
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.tune.loop import BATCH
 
 
 @pytest.fixture(scope="module")
-def report(bundle: Bundle) -> ResourcesReport:
+def report(bundle: Bundle) -> dict[str, Any]:
     return measure_resources(bundle, 1, 1, lambda *_: None)
 
 
 @pytest.fixture(scope="module")
-def costs(bundle: Bundle) -> tuple[Cost, ...]:
-    return tuple(cost_of(bundle, shape) for shape in layer_shapes(bundle))
+def costs(bundle: Bundle) -> list[Cost]:
+    return [cost_of(bundle, number) for number in bundle.network.last(6)]
 
 
 def products_in(counter: FlopCounterMode) -> int:
@@ -50,7 +54,7 @@ def products_in(counter: FlopCounterMode) -> int:
 
 
 def test_the_papers_table_comes_out_of_its_counting_rule(bundle: Bundle) -> None:
-    rows = {shape.number: counted_row(shape) for shape in layer_shapes(bundle)}
+    rows = {number: counted_row(bundle.network, number) for number in bundle.network.last(6)}
     assert list(rows) == [*PUBLISHED]
     for layer, printed in PUBLISHED.items():
         assert rows[layer].mac == printed.mac
@@ -62,15 +66,14 @@ def test_the_papers_table_comes_out_of_its_counting_rule(bundle: Bundle) -> None
 
 
 def test_the_papers_parameters_are_those_of_its_network_and_sgms_in_torch(bundle: Bundle) -> None:
-    net = graspnet.GraspNet()
-    for shape in layer_shapes(bundle):
-        row = counted_row(shape)
-        layer = net.layers[shape.number - 1]
+    net = ConvNet(GRASPNET)
+    for number in bundle.network.last(6):
+        row = counted_row(bundle.network, number)
+        layer = net.layers[number - 1]
         assert row.parameters == sum(p.numel() for p in layer.parameters())
         if row.sgm_parameters:
-            sgm = Sgm(shape.number)
+            sgm = Sgm(GRASPNET, number)
             assert row.sgm_parameters == sum(p.numel() for p in sgm.parameters())
-    assert STRIDES == graspnet.STRIDES
 
 
 @pytest.mark.parametrize(
@@ -82,10 +85,8 @@ def test_counts_are_rounded_to_two_decimals_of_their_unit(count: int, printed: i
 
 
 @pytest.mark.parametrize("tuned", [1, 2, 3, 6])
-def test_forward_and_backpropagation_cost_what_torch_counts(
-    costs: tuple[Cost, ...], tuned: int
-) -> None:
-    net = graspnet.GraspNet().eval()
+def test_forward_and_backpropagation_cost_what_torch_counts(costs: list[Cost], tuned: int) -> None:
+    net = ConvNet(GRASPNET).eval()
     with torch.no_grad():
         x = net.between(torch.rand(1, 3, 128, 128), 1, 6 - tuned) if tuned < 6 else None
     x = torch.rand(1, 3, 128, 128) if x is None else x
@@ -93,30 +94,30 @@ def test_forward_and_backpropagation_cost_what_torch_counts(
         raw = net.between(x, 7 - tuned, 6)
     with FlopCounterMode(display=False) as backward:
         raw.sum().backward()
-    step = step_cost(costs[-tuned:], {})
-    assert step.forward == BATCH * products_in(forward)
-    assert step.backprop - step.forward == BATCH * products_in(backward)
+    step = step_macs(costs[-tuned:])
+    assert step["forward"] == BATCH * products_in(forward)
+    assert step["backprop"] - step["forward"] == BATCH * products_in(backward)
 
 
 def test_an_sgm_costs_what_torch_counts_and_int8_one_product_per_plane(
-    bundle: Bundle, costs: tuple[Cost, ...]
+    bundle: Bundle, costs: list[Cost]
 ) -> None:
-    net = graspnet.GraspNet().eval()
+    net = ConvNet(GRASPNET).eval()
     for cost in costs[:-1]:
         with torch.no_grad():
-            x = net.between(torch.rand(1, 3, 128, 128), 1, cost.layer)
-        sgm = bundle.float_sgm(cost.layer)
+            x = net.between(torch.rand(1, 3, 128, 128), 1, cost["layer"])
+        sgm = bundle.float_sgm(cost["layer"])
         x = F.pad(x, (0, 0, 0, 0, 0, 3))
         between = 0
         with FlopCounterMode(display=False) as counter:
             for conv in sgm.convs:
                 between += x.numel()
-                x = F.conv2d(x, torch.from_numpy(conv.weight), padding=sgm.kernel // 2)
-        assert cost.sgm_float == products_in(counter)
+                x = F.conv2d(x, torch.from_numpy(conv.weight), padding="same")
+        assert cost["sgm_float"] == products_in(counter)
         # high by coarse, high by fine, low by coarse
-        assert bundle.activation_bits(cost.layer) == 16
-        assert cost.sgm_int8 == 3 * cost.sgm_float
-        assert (cost.sgm_tensor_bytes_float, cost.sgm_tensor_bytes_int8) == (
+        assert bundle.activation_bits(cost["layer"]) == 16
+        assert cost["sgm_int8"] == 3 * cost["sgm_float"]
+        assert (cost["sgm_tensor_bytes_float"], cost["sgm_tensor_bytes_int8"]) == (
             4 * between,
             2 * between,
         )
@@ -131,7 +132,7 @@ def test_bytes_of_an_int8_sgm_are_those_of_its_constants(bits: ActivationBits, k
         weight = rng.normal(size=(out, into, kernel, kernel)).astype(np.float32)
         return FoldedConv(weight, rng.normal(size=out).astype(np.float32))
 
-    sgm = FoldedSgm(3, (conv(12, 7), conv(9, 12), conv(4, 9)))
+    sgm = FoldedSgm(3, (5, 5), (conv(12, 7), conv(9, 12), conv(4, 9)))
     inputs = rng.uniform(size=(2, 25, 7)).astype(np.float32)
     hidden = tuple(tensor.max(axis=(0, 1)) + 1 for tensor in float_trace(sgm, inputs)[1])
     ranges = SgmRanges(np.zeros(7, np.float32), np.ones(7, np.float32), hidden)
@@ -141,9 +142,9 @@ def test_bytes_of_an_int8_sgm_are_those_of_its_constants(bits: ActivationBits, k
 
 @pytest.mark.parametrize("tuned", range(1, 7))
 def test_a_step_with_sgms_costs_what_torch_counts_and_carries_no_gradient_back(
-    bundle: Bundle, costs: tuple[Cost, ...], tuned: int
+    bundle: Bundle, costs: list[Cost], tuned: int
 ) -> None:
-    net = graspnet.GraspNet().eval()
+    net = ConvNet(GRASPNET).eval()
     x = torch.rand(1, 3, 128, 128)
     with torch.no_grad():
         x = net.between(x, 1, 6 - tuned) if tuned < 6 else x
@@ -158,13 +159,13 @@ def test_a_step_with_sgms_costs_what_torch_counts_and_carries_no_gradient_back(
             with FlopCounterMode(display=False) as counter:
                 run_folded_sgm(bundle.float_sgm(layer), x.detach(), torch.zeros(1, 3))
             of_sgms += BATCH * products_in(counter)
-    step = step_cost(costs[-tuned:], {})
-    assert step.sgm_float == of_layers + of_sgms
-    assert step.sgm_int8 == of_layers + 3 * of_sgms
+    step = step_macs(costs[-tuned:])
+    assert step["sgm_float"] == of_layers + of_sgms
+    assert step["sgm_int8"] == of_layers + 3 * of_sgms
 
 
 def test_the_timed_step_changes_no_weight(bundle: Bundle) -> None:
-    step = step_job(bundle, "int8", single_layers(3), 1)
+    step = step_job(bundle, "int8", single_layers(bundle.network.last(3)), 1)
     losses = [step() for _ in range(3)]
     assert losses[0] == losses[1] == losses[2]
 
@@ -184,11 +185,11 @@ def test_every_step_is_timed_and_everything_is_in_the_json(
         assert min(step["ms"].values()) > 0
 
 
-def test_the_tables_fit_into_80_columns(report: ResourcesReport) -> None:
+def test_the_tables_fit_into_80_columns(report: dict[str, Any]) -> None:
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(report.render())
+    console.print(render(report))
     wide = Console(width=200, record=True, file=io.StringIO())
-    wide.print(report.render())
+    wide.print(render(report))
     lines = [line.rstrip() for line in console.export_text().splitlines()]
     assert max(map(len, lines)) <= 80
     tables = [line for line in wide.export_text().splitlines() if "──" in line]
@@ -202,14 +203,5 @@ def test_outputs_are_counted_as_documented() -> None:
     maps = [8 * 62 * 62, 8 * 29 * 29, 16 * 13 * 13, 16 * 5 * 5, 16, 0]
     pooled = [0, 0, 0, 16, 0, 3]
     layers = [4 * 32 * (2 * one + rest) for one, rest in zip(maps, pooled, strict=True)]
-
-    def peak(text: str) -> list[int]:
-        values = output_bytes(parse_blocks(text))
-        return [values["sgm"], values["backprop"]]
-
-    assert peak("6") == [layers[5], layers[5]]
-    assert peak("4,5,6") == [layers[3], sum(layers[3:])]
-    assert peak("4-5,6") == [sum(layers[3:5]), sum(layers[3:])]
-    assert peak("1,2,3,4,5,6") == [layers[0], sum(layers)]
-    assert peak("2-4,5,6") == [sum(layers[1:4]), sum(layers[1:])]
-    assert peak("1-6") == [sum(layers), sum(layers)]
+    for tuned in range(1, 7):
+        assert output_bytes(GRASPNET, tuned) == layers[-tuned:]

@@ -19,11 +19,13 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from qsgm.bench.frames import MANIFEST, BenchFrame, list_frames
-from qsgm.blocks import tuned_layers
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
-from qsgm.grasp.crops import TRAIN_CROPS
-from qsgm.sgm.float import FloatArray, float_trace
+from qsgm.grasp.teach import prepare_object
+from qsgm.manifest import PRECISIONS
+from qsgm.progress import Progress
+from qsgm.schedule import steps_per_epoch
+from qsgm.sgm.float import float_trace
 from qsgm.sgm.int8 import (
     ACTIVATION_BITS,
     WEIGHT_BITS,
@@ -35,17 +37,18 @@ from qsgm.sgm.int8 import (
     quantize_sgm,
 )
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
-from qsgm.tune.loop import BATCH
-from qsgm.tune.prepare import Prepared, Watch, prepare
-from qsgm.tune.probe import Exchanged, activations_before, activations_of, open_probe
-from qsgm.tune.recalibrate import GROWTH, grown, ranges_of
-from qsgm.tune.report import number, plain_table
-from qsgm.tune.run import FinetuneResult, train
-from qsgm.tune.settings import Settings, sgm_blocks
+from qsgm.tables import TIGHT, keyed_table, number
+from qsgm.task import label_span
+from qsgm.tune.plan import Plan, resolve
+from qsgm.tune.prepare import Prepared
+from qsgm.tune.probe import activations_of, open_probe
+from qsgm.tune.recalibrate import GROWTH, activations_before, grown, ranges_of, typical_labels
+from qsgm.tune.result import Result
+from qsgm.tune.run import Keeper, train, tune
+from qsgm.tune.settings import Settings
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Rows = NDArray[np.int64]
 Observed = Mapping[int, SgmObservers]
 
 # Of each run on a calibration frame: steps between two looks, crops looked at.
@@ -70,8 +73,21 @@ METRICS = (
 COS_FLOAT, COS_TRUE, CLIPPED, DETECTION, ANGLE, WARNED = range(len(METRICS))
 LEGEND = """N/M: bits of activations/weights; means over frames; cos: of int8 to float
 gradients, and the worst frame's; true: to true ones; clip: share of inputs
-outside their ranges, in %; angle: error in degrees, modulo 180°; lost: share of
+outside their ranges; angle: error in degrees, modulo 180°; lost: share of
 frames worse than with float SGMs; warned: share of frames with a warning"""
+
+
+# key of a summary, heading, format
+_COLUMNS = (
+    ("cos_int8_float", "cos", "{:.4f}"),
+    ("cos_int8_float_worst", "worst", "{:.4f}"),
+    ("cos_int8_true", "cos true", "{:.3f}"),
+    ("clipped_fraction", "clip", "{:.2%}"),
+    ("detection_accuracy", "detect", "{:.3f}"),
+    ("angle_mae_deg", "angle", "{:.2f}"),
+    ("lost", "lost", "{:.0%}"),
+    ("warned", "warned", "{:.0%}"),
+)
 
 
 @dataclass(frozen=True)
@@ -88,20 +104,15 @@ class Variant:
 
 def parse_variant(text: str) -> Variant:
     """A variant as it prints, such as `8/16/minmax`. Raises QsgmError for anything else."""
-    for activation_bits, weight_bits, name in product(ACTIVATION_BITS, WEIGHT_BITS, CALIBRATORS):
-        variant = Variant(activation_bits, weight_bits, name)
+    known = [Variant(*one) for one in product(ACTIVATION_BITS, WEIGHT_BITS, CALIBRATORS)]
+    for variant in known:
         if str(variant) == text:
             return variant
+    bits = [", ".join(map(str, some)) for some in (ACTIVATION_BITS, WEIGHT_BITS)]
     raise QsgmError(
-        f"{text!r} is no variant: expected bits of activations ({bits_text(ACTIVATION_BITS)}) and "
-        f"of weights ({bits_text(WEIGHT_BITS)}) and a calibrator ({', '.join(CALIBRATORS)}), such "
-        "as 8/16/minmax"
+        f"{text!r} is no variant: expected bits of activations ({bits[0]}) and of weights "
+        f"({bits[1]}) and a calibrator ({', '.join(CALIBRATORS)}), such as 8/16/minmax"
     )
-
-
-def bits_text(bits: Sequence[int]) -> str:
-    """Numbers in a message."""
-    return ", ".join(map(str, bits))
 
 
 # (layer, variant) -> what its SGM has to cover
@@ -177,6 +188,7 @@ class CalibrationReport:
             "epochs": self.settings.epochs,
             "seed": self.settings.seed,
             "frames": [frame.name for frame in self.frames],
+            "angles_of_frames": int(self.elongated.sum()),
             "float": {
                 "cos_float_true": number(floating[:, COS_TRUE].mean(), 4),
                 "detection_accuracy": number(floating[:, DETECTION].mean(), 4),
@@ -195,46 +207,13 @@ class CalibrationReport:
             "watch": self.watch_rates(),
         }
 
-    def render(self) -> RenderableType:
-        """A table per variant, its rows from far to near."""
-        floating = self.floating
-        title = Text(
-            f"float SGMs: cos to true {floating[:, COS_TRUE].mean():.3f}, detection"
-            f" {floating[:, DETECTION].mean():.3f}, angle"
-            f" {floating[self.elongated, ANGLE].mean():.2f}"
-        )
-        tables = [self._table(k) for k in range(len(self.variants))]
-        rates = ", ".join(f"{name} {value}" for name, value in self.watch_rates().items())
-        return Group(title, *tables, Text(f"watch: {rates}"), Text(LEGEND))
-
-    def _table(self, k: int) -> RenderableType:
-        table = plain_table(str(self.variants[k]))
-        table.add_column("calibrated on")
-        for heading in ("cos", "worst", "cos true", "clip", "detect", "angle", "lost", "warned"):
-            table.add_column(heading, justify="right")
-        for i, source in enumerate(self.sources):
-            row = {name: value or 0.0 for name, value in self.summary(i, k).items()}
-            table.add_row(
-                source,
-                f"{row['cos_int8_float']:.4f}",
-                f"{row['cos_int8_float_worst']:.4f}",
-                f"{row['cos_int8_true']:.3f}",
-                f"{100 * row['clipped_fraction']:.2f}",
-                f"{row['detection_accuracy']:.3f}",
-                f"{row['angle_mae_deg']:.2f}",
-                f"{row['lost']:.0%}",
-                f"{row['warned']:.0%}",
-            )
-        table.padding = 0
-        return table
-
 
 def measure_calibration(
     frames: Sequence[BenchFrame],
     calibration_folder: Path,
     bundle: Bundle,
     settings: Settings,
-    watch: Watch,
+    watch: Progress,
     variants: Sequence[Variant] = VARIANTS,
 ) -> CalibrationReport:
     """Calibrate on every set, tune every frame with what comes of it.
@@ -252,7 +231,8 @@ def measure_calibration(
             diverged.
     """
     settings = replace(settings, precision="int8")
-    layers = tuned_layers(settings.layers)[:-1]
+    plan, floats = (resolve(replace(settings, precision=name), bundle) for name in PRECISIONS)
+    layers = plan.layers[:-1]
     if any(bundle.activation_bits(layer) != 16 for layer in layers):
         raise QsgmError(
             f"the bundle {bundle.folder} holds SGMs with 8 bit activations, expected 16: other "
@@ -262,15 +242,15 @@ def measure_calibration(
     sources = {}
     for done, (name, images) in enumerate(sets.items()):
         watch("calibrate", done, len(sets))
-        sources[name] = ranges_seen(observe_set(images, bundle, settings, layers))
+        sources[name] = ranges_seen(observe_set(images, bundle, floats), bundle)
     watch("calibrate", len(sets), len(sets))
     results, floating = [], []
     for done, frame in enumerate(frames):
         watch("judge", done, len(frames))
-        prepared = prepare(frame.read(), bundle, settings)
-        floating.append(metrics_of(train(prepared, replace(settings, precision="float"))))
-        own = own_sources(prepared, settings, layers)
-        results.append(judge(prepared, settings, [*sources.values(), *own.values()], variants))
+        prepared = prepare_object(frame.read(), bundle, plan)
+        floating.append(metrics_of(tune(prepared, floats)))
+        own = own_sources(prepared, floats)
+        results.append(judge(prepared, plan, [*sources.values(), *own.values()], variants))
     watch("judge", len(frames), len(frames))
     return CalibrationReport(
         settings,
@@ -314,109 +294,108 @@ def table_kinds(folder: Path) -> list[bool]:
     return kinds or [False] * len(list_frames(folder))
 
 
-def observe_set(
-    images: Sequence[Image], bundle: Bundle, settings: Settings, layers: Sequence[int]
-) -> Observed:
+def observe_set(images: Sequence[Image], bundle: Bundle, plan: Plan) -> Observed:
     """What each SGM sees in float runs on some frames, whose crops are dropped one by one."""
-    total = {layer: SgmObservers(bundle.float_sgm(layer)) for layer in layers}
+    total = {layer: SgmObservers(bundle.float_sgm(layer)) for layer in plan.layers[:-1]}
     for image in images:
-        prepared = prepare(image, bundle, settings)
-        for layer, observers in observe_run(prepared, settings, layers).items():
+        prepared = prepare_object(image, bundle, plan)
+        for layer, observers in observe_run(prepared, plan).items():
             total[layer].merge(observers)
     return total
 
 
-def observe_run(prepared: Prepared, settings: Settings, layers: Sequence[int]) -> Observed:
+def observe_run(prepared: Prepared, plan: Plan) -> Observed:
     """What each SGM sees in one float run, every now and then on some of the crops."""
-    steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
-    floating = replace(settings, precision="float")
-    run = train(prepared, floating, probe=False, keep=range(0, steps + 1, OBSERVE_EVERY_STEPS))
-    rng = np.random.default_rng([settings.seed, 3])
-    sgms = {layer: prepared.bundle.float_sgm(layer) for layer in layers}
+    steps = plan.epochs * steps_per_epoch(prepared.taught)
+    keeper = Keeper(range(0, steps + 1, OBSERVE_EVERY_STEPS))
+    train(prepared, plan, (keeper,))
+    rng = np.random.default_rng([plan.settings.seed, 3])
+    sgms = {layer: prepared.bundle.float_sgm(layer) for layer in plan.layers[:-1]}
     observers = {layer: SgmObservers(sgm) for layer, sgm in sgms.items()}
-    session = open_probe(prepared, settings)
-    for weights in run.kept.values():
-        rows = rng.choice(TRAIN_CROPS, OBSERVED_CROPS, replace=False)
-        for layer, seen in seen_by_sgms(session, prepared, settings, weights, rows).items():
+    session = open_probe(prepared.bundle, plan)
+    for weights in keeper.kept.values():
+        rows = rng.choice(prepared.taught, OBSERVED_CROPS, replace=False)
+        labels = prepared.labels[rows][:, None]  # (B, 1, L)
+        for layer, x in activations_of(session, prepared, plan, weights, rows).items():
+            seen = np.concatenate([x, np.repeat(labels, x.shape[1], axis=1)], axis=2)
             observers[layer].update(seen, float_trace(sgms[layer], seen)[1])
     return observers
 
 
-def seen_by_sgms(
-    session: Any,  # of the probe graph
-    prepared: Prepared,
-    settings: Settings,
-    weights: Mapping[str, FloatArray],
-    rows: Rows,
-) -> dict[int, FloatArray]:
-    """By layer, activation and label (B, P, Ci) of the crops `rows` with these weights."""
-    activations = activations_of(session, prepared, settings, weights, rows)
-    labels = prepared.labels[rows][:, None]  # (B, 1, 3)
-    return {
-        layer: np.concatenate([x, np.repeat(labels, x.shape[1], axis=1)], axis=2)
-        for layer, x in activations.items()
-    }
-
-
-def ranges_seen(observed: Observed) -> RangesOf:
+def ranges_seen(observed: Observed, bundle: Bundle) -> RangesOf:
     """Ranges by what was observed along runs."""
+    span = label_span(bundle.manifest.heads)
 
     def ranges(layer: int, variant: Variant) -> SgmRanges:
-        return observed[layer].ranges(variant.calibrator, 2**variant.activation_bits)
+        return observed[layer].ranges(variant.calibrator, 2**variant.activation_bits, span)
 
     return ranges
 
 
-def own_sources(
-    prepared: Prepared, settings: Settings, layers: Sequence[int]
-) -> dict[str, RangesOf]:
+def own_sources(prepared: Prepared, plan: Plan) -> dict[str, RangesOf]:
     """The nearest there is: a run on the very object, and its crops before any run."""
-    activations = activations_before(prepared, settings)
-    sgms = {layer: prepared.bundle.float_sgm(layer) for layer in layers}
-    crops = {layer: ranges_of(sgm, activations[layer]) for layer, sgm in sgms.items()}
+    bundle, span = prepared.bundle, label_span(prepared.bundle.manifest.heads)
+    labels = typical_labels(prepared.labels[: prepared.taught])
+    crops = {
+        layer: ranges_of(bundle.float_sgm(layer), activation, labels, span)
+        for layer, activation in activations_before(prepared, plan).items()
+    }
 
     def ranges(layer: int, variant: Variant) -> SgmRanges:
-        return grown(crops[layer], GROWTH[variant.activation_bits])
+        return grown(crops[layer], GROWTH[variant.activation_bits], labels.shape[1])
 
-    return {OWN_RUN: ranges_seen(observe_run(prepared, settings, layers)), OWN_CROPS: ranges}
+    return {OWN_RUN: ranges_seen(observe_run(prepared, plan), bundle), OWN_CROPS: ranges}
 
 
 def judge(
-    prepared: Prepared,
-    settings: Settings,
-    sources: Sequence[RangesOf],
-    variants: Sequence[Variant],
+    prepared: Prepared, plan: Plan, sources: Sequence[RangesOf], variants: Sequence[Variant]
 ) -> list[list[list[float]]]:
     """Metrics of one run per source and variant on one frame."""
     return [
-        [
-            metrics_of(train(prepared, settings, exchanged=exchange(prepared, settings, *one)))
-            for one in product([ranges], variants)
-        ]
-        for ranges in sources
+        [metrics_of(tune(prepared, exchanged(prepared.bundle, plan, *one))) for one in some]
+        for some in ([(ranges, variant) for variant in variants] for ranges in sources)
     ]
 
 
-def exchange(
-    prepared: Prepared, settings: Settings, ranges: RangesOf, variant: Variant
-) -> Exchanged:
-    """Constants for the bundle's graphs: its SGMs, quantized in another way."""
-    exchanged = {}
-    for layer in sgm_blocks(settings).sgm_layers:
+def exchanged(bundle: Bundle, plan: Plan, ranges: RangesOf, variant: Variant) -> Plan:
+    """The same run by the bundle's graphs, its SGMs quantized in another way."""
+    overrides = {}
+    for layer in plan.sgm_blocks.sgm_layers:
         bits = variant.activation_bits, variant.weight_bits
-        q = quantize_sgm(prepared.bundle.float_sgm(layer), ranges(layer, variant), *bits)
-        exchanged[layer] = constants(q) if q.bits == 16 else constants_of_two_planes(q)
-    return exchanged
+        q = quantize_sgm(bundle.float_sgm(layer), ranges(layer, variant), *bits)
+        overrides[layer] = constants(q) if q.bits == 16 else constants_of_two_planes(q)
+    return replace(plan, overrides=overrides)
 
 
-def metrics_of(result: FinetuneResult) -> list[float]:
+def metrics_of(result: Result) -> list[float]:
     """One run's, in the order of :data:`METRICS`."""
     layers = result.fidelity.values()
     return [
         min(layer.cos_int8_float for layer in layers),
         float(np.mean([layer.cos_int8_true for layer in layers])),
         max(layer.clipped_fraction for layer in layers),
-        result.accuracy.detection_accuracy,
-        result.accuracy.angle_mae_deg,
+        result.scores["detection_accuracy"] or 0.0,
+        result.scores["angle_mae_deg"] or 0.0,
         float(bool(result.warnings)),
     ]
+
+
+def render(values: Mapping[str, Any]) -> RenderableType:
+    """A table per variant, its rows from far to near."""
+    floating, sources = values["float"], values["sources"]
+    title = (
+        f"float SGMs: cos to true {floating['cos_float_true']:.3f}, detection"
+        f" {floating['detection_accuracy']:.3f}, angle {floating['angle_mae_deg']:.2f}"
+    )
+    tables = [
+        keyed_table(
+            variant,
+            "calibrated on",
+            _COLUMNS,
+            {name: row[variant] for name, row in sources.items()},
+            padding=TIGHT,
+        )
+        for variant in next(iter(sources.values()))
+    ]
+    rates = ", ".join(f"{name} {value}" for name, value in values["watch"].items())
+    return Group(Text(title), *tables, Text(f"watch: {rates}"), Text(LEGEND))

@@ -6,6 +6,7 @@ A manifest is a JSON list of objects, or an object with such a list as `frames`.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,13 @@ def list_frames(folder: Path, limit: int | None = None) -> list[BenchFrame]:
     if limit is None or limit >= len(frames):
         return frames
     return [frames[i * len(frames) // limit] for i in range(limit)]
+
+
+def groups_of(frames: Sequence[BenchFrame]) -> dict[str, list[int]]:
+    """Places of all frames and, where a manifest says which they are, of the elongated ones."""
+    elongated = [i for i, frame in enumerate(frames) if frame.elongated]
+    groups = {"all": list(range(len(frames)))}
+    return groups | {"elongated": elongated} if elongated else groups
 
 
 def _from_manifest(folder: Path, path: Path) -> list[BenchFrame]:

@@ -8,7 +8,7 @@ it, whatever is found is a false alarm. Intervals are bootstrapped over pairs of
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -277,28 +277,6 @@ def paired_difference(
     rng = np.random.default_rng(seed)
     rows = (rng.integers(len(difference), size=len(difference)) for _ in range(resamples))
     return float(difference.mean()), _middle_95([difference[row].mean() for row in rows])
-
-
-def difference_of_reports(
-    first: Mapping[str, Any], second: Mapping[str, Any], seed: int = 0
-) -> tuple[float, tuple[float, float]]:
-    """Right places of one report of `bench scenes` minus another's, on the scenes of both."""
-    mine, theirs = _right_by_scene(first), _right_by_scene(second)
-    both = sorted(set(mine) & set(theirs))
-    return paired_difference(
-        np.array([mine[key] for key in both]), np.array([theirs[key] for key in both]), seed
-    )
-
-
-def _right_by_scene(report: Mapping[str, Any]) -> dict[tuple[Any, ...], bool]:
-    return {
-        (scene["frame"], scene["condition"], scene["number"], *scene["true_center_px"]): scene[
-            "outcome"
-        ]
-        == "right_place"
-        for scene in report["per_scene"]
-        if scene["present"]
-    }
 
 
 def _near(others: Mask, point: Point) -> bool:

@@ -26,8 +26,8 @@ from qsgm.bench.scenes import ScenePlan
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
 from qsgm.images import write_png
-from qsgm.tune.prepare import Watch
-from qsgm.tune.report import to_json
+from qsgm.progress import Progress
+from qsgm.tables import to_json
 
 DEMONSTRATION = "demonstration.png"
 MASK = "mask.png"
@@ -110,7 +110,7 @@ def write_subject(folder: Path, subject: Subject, scenes: Sequence[Frame]) -> li
     return files
 
 
-def keep_scenes(plan: ScenePlan, folder: Path, watch: Watch) -> None:
+def keep_scenes(plan: ScenePlan, folder: Path, watch: Progress) -> None:
     """Write every scene of a plan, a folder per subject, and `truth.json` beside them."""
     composer = Composer(plan.subjects)
     for done, number in enumerate(plan.taught, start=1):

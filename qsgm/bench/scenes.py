@@ -10,10 +10,12 @@ import numpy as np
 from qsgm.bench.composing import CONDITIONS, Composer, Condition, Scene, Subject
 from qsgm.bench.cutouts import Frame
 from qsgm.bench.judging import Answer, Judged, Tally, Truth, judge, threshold_for, truth_of
-from qsgm.bundle import Bundle, Recipe
+from qsgm.bundle import Bundle
 from qsgm.grasp.heatmap import Detection
-from qsgm.tune.prepare import Watch, prepare
-from qsgm.tune.run import train
+from qsgm.grasp.teach import prepare_object, train_object
+from qsgm.manifest import Recipe
+from qsgm.progress import Progress
+from qsgm.tune.plan import resolve
 from qsgm.tune.settings import Settings
 
 # Told about every scene as it is judged, while its picture is at hand.
@@ -66,9 +68,9 @@ class TunedMethod:
 
     def answers(self, subject: Subject, scenes: Sequence[Frame]) -> list[Answer]:
         """Tune on the subject's demonstration and locate it in every scene."""
-        prepared = prepare(subject.frame, self.bundle, self.settings)
-        result = train(prepared, self.settings, probe=False, recipe=self.recipe)
-        tuned = result.tuned_object(subject.name)
+        plan = resolve(self.settings, self.bundle, self.recipe)
+        prepared = prepare_object(subject.frame, self.bundle, plan)
+        tuned = train_object(prepared, plan).tuned_object(subject.name)
         answers = []
         for scene in scenes:
             began = time.perf_counter()
@@ -106,7 +108,7 @@ class MethodResults:
 
 
 def measure_scenes(
-    plan: ScenePlan, methods: Sequence[Method], watch: Watch, look: Look | None = None
+    plan: ScenePlan, methods: Sequence[Method], watch: Progress, look: Look | None = None
 ) -> list[MethodResults]:
     """Every method's answers to the same scenes.
 

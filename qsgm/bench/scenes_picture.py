@@ -105,7 +105,7 @@ def annotated(scene: Scene, judged: Judged, thickness: int) -> Picture:
 
 
 def draw_scenes(values: dict[str, Any], album: Album) -> Picture:
-    """The whole picture of a report (:meth:`ScenesReport.to_json`)."""
+    """The whole picture of a report (:func:`qsgm.bench.scenes_report.report_json`)."""
     conditions: dict[str, Any] = values["conditions"]
     height = _TOP + _ROW * (len(conditions) + 1) + _BOTTOM
     page = np.full((_SCALE * height, _SCALE * _WIDTH, 3), _PAPER, dtype=np.uint8)

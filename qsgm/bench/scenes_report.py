@@ -1,8 +1,8 @@
 """What was found in composed scenes, as JSON and as tables."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from qsgm.bench.judging import (
     shares,
 )
 from qsgm.bench.scenes import MethodResults, ScenePlan
-from qsgm.tune.report import number, plain_table
+from qsgm.tables import DASH, TIGHT, legend, number, table
 from qsgm.tune.settings import Settings
 
 POOLED = "pooled"
@@ -50,100 +50,105 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class ScenesReport:
-    """All answers to all scenes; the first method is the one measured, the others are rivals."""
+def report_json(
+    plan: ScenePlan, settings: Settings, bundle: Path, source: str, methods: Sequence[MethodResults]
+) -> dict[str, Any]:
+    """All answers to all scenes.
 
-    plan: ScenePlan
-    settings: Settings
-    bundle: Path
-    source: str  # where the subjects come from
-    methods: tuple[MethodResults, ...]
+    Args:
+        plan: of the scenes.
+        settings: of the first method.
+        bundle: of the first method.
+        source: where the subjects come from.
+        methods: the first is the one measured, the others are rivals.
+    """
+    measured = methods[0]
+    return {
+        "bundle": str(bundle),
+        "method": settings.method,
+        "precision": settings.precision,
+        "layers": settings.layers,
+        "epochs": settings.epochs,
+        "seed": settings.seed,
+        "frames": source,
+        "objects": len(plan.taught),
+        "pairs_per_condition_and_object": plan.count,
+        **summary(measured.results),
+        **by_condition(measured, plan, shares),
+        "at_false_alarm_rate": at_rate(plan, methods),
+        "per_scene": [_scene_json(result) for result in measured.results],
+    }
 
-    @property
-    def measured(self) -> MethodResults:
-        return self.methods[0]
 
-    def summary(self) -> dict[str, float | int | None]:
-        """The figures of all conditions together."""
-        results = self.measured.results
-        present = [result for result in results if result.truth.present]
-        empty = [result for result in results if not result.truth.present]
-        outcomes = [result.outcome for result in results]
-        elsewhere = outcomes.count("wrong_thing") + outcomes.count("background")
-        alarms = outcomes.count("false_alarm")
-        found = errors(results)
-        return {
-            "scenes": len(present),
-            "empty_scenes": len(empty),
-            "median_center_error_px": number(found["median_center_error_px"], 2),
-            "median_turn_error_deg": number(found["median_turn_error_deg"], 2),
-            "found_share": number(outcomes.count("right_place") / max(len(present), 1), 4),
-            "missed": outcomes.count("missed"),
-            "false_detections": elsewhere + alarms,
-            "false_detections_elsewhere": elsewhere,
-            "false_detections_empty": alarms,
-            "free_of_false_detections": number(1 - (elsewhere + alarms) / max(len(results), 1), 4),
-        }
+def summary(results: Sequence[Judged]) -> dict[str, float | int | None]:
+    """The figures of all conditions together."""
+    present = sum(result.truth.present for result in results)
+    outcomes = Counter(result.outcome for result in results)
+    elsewhere = outcomes["wrong_thing"] + outcomes["background"]
+    alarms = outcomes["false_alarm"]
+    found = errors(results)
+    return {
+        "scenes": present,
+        "empty_scenes": len(results) - present,
+        "median_center_error_px": number(found["median_center_error_px"], 2),
+        "median_turn_error_deg": number(found["median_turn_error_deg"], 2),
+        "found_share": number(outcomes["right_place"] / max(present, 1), 4),
+        "missed": outcomes["missed"],
+        "false_detections": elsewhere + alarms,
+        "false_detections_elsewhere": elsewhere,
+        "false_detections_empty": alarms,
+        "free_of_false_detections": number(1 - (elsewhere + alarms) / max(len(results), 1), 4),
+    }
 
-    def to_json(self) -> dict[str, Any]:
-        plan, settings = self.plan, self.settings
-        return {
-            "bundle": str(self.bundle),
-            "method": settings.method,
-            "precision": settings.precision,
-            "layers": settings.layers,
-            "epochs": settings.epochs,
-            "seed": settings.seed,
-            "frames": self.source,
-            "objects": len(plan.taught),
-            "pairs_per_condition_and_object": plan.count,
-            **self.summary(),
-            "conditions": {
-                name: figures(self.measured.of(name), plan.seed) for name in plan.conditions
-            },
-            POOLED: figures(self.measured.results, plan.seed),
-            "at_false_alarm_rate": self.at_rate(),
-            "per_scene": [_scene_json(result) for result in self.measured.results],
-        }
 
-    def at_rate(self) -> dict[str, Any]:
-        """Every method at its threshold for 2 % false alarms, and the differences to the first."""
-        levelled = [method.at_false_alarm_rate() for method in self.methods]
-        mine = Tally.of(levelled[0].results).right
-        values: dict[str, Any] = {"rate": FALSE_ALARM_RATE, "methods": {}}
-        for method in levelled:
-            values["methods"][method.name] = {
+def by_condition(
+    method: MethodResults, plan: ScenePlan, statistics: Callable[[Tally], Mapping[str, float]]
+) -> dict[str, Any]:
+    """One method's figures in every condition, and of all."""
+    of = {name: figures(method.of(name), plan.seed, statistics) for name in plan.conditions}
+    return {"conditions": of, POOLED: figures(method.results, plan.seed, statistics)}
+
+
+def at_rate(plan: ScenePlan, methods: Sequence[MethodResults]) -> dict[str, Any]:
+    """Every method at its threshold for 2 % false alarms, and the differences to the first."""
+    levelled = [method.at_false_alarm_rate() for method in methods]
+    mine, *theirs = (Tally.of(method.results).right for method in levelled)
+    differences = {
+        rival.name: paired_difference(mine, right, plan.seed)
+        for rival, right in zip(levelled[1:], theirs, strict=True)
+    }
+    return {
+        "rate": FALSE_ALARM_RATE,
+        "methods": {
+            method.name: {
                 "threshold": number(method.threshold, 4),
                 "seconds_per_scene": _median_seconds(method.results),
-                "conditions": {
-                    name: figures(method.of(name), self.plan.seed, outcome_shares)
-                    for name in self.plan.conditions
-                },
-                POOLED: figures(method.results, self.plan.seed, outcome_shares),
+                **by_condition(method, plan, outcome_shares),
             }
-        values["right_place_minus"] = {
-            rival.name: _difference_json(mine, Tally.of(rival.results).right, self.plan.seed)
-            for rival in levelled[1:]
-        }
-        return values
+            for method in levelled
+        },
+        "right_place_minus": {
+            name: {
+                "difference": number(difference, 4),
+                "interval_95": [number(low, 4), number(high, 4)],
+            }
+            for name, (difference, (low, high)) in differences.items()
+        },
+    }
 
-    def render(self, values: dict[str, Any]) -> RenderableType:
-        """Tables for people of what :meth:`to_json` gave."""
-        parts: list[RenderableType] = [
-            conditions_table(values),
-            Text(intervals_line(values)),
-            Text(LEGEND, style="dim"),
-        ]
-        if len(self.methods) > 1:
-            parts += [methods_table(values["at_false_alarm_rate"]), *difference_lines(values)]
-        return Group(*parts)
+
+def render(values: dict[str, Any]) -> RenderableType:
+    """Tables for people of what :func:`report_json` gave."""
+    levelled = values["at_false_alarm_rate"]
+    rivals = [methods_table(levelled)] if len(levelled["methods"]) > 1 else []
+    texts = Text(intervals_line(values)), legend(LEGEND)
+    return Group(conditions_table(values), *texts, *rivals, *difference_lines(levelled))
 
 
 def figures(
     results: Sequence[Judged],
     seed: int,
-    statistics: Callable[[Tally], Mapping[str, float]] = shares,
+    statistics: Callable[[Tally], Mapping[str, float]],
 ) -> dict[str, Any]:
     """Shares with their 95 % intervals, and errors."""
     tally = Tally.of(results)
@@ -161,44 +166,34 @@ def figures(
 
 def conditions_table(values: dict[str, Any]) -> Table:
     """A row per condition and one of all."""
-    table = plain_table(
+    rows: list[list[object]] = [
+        [_plain(name), *(_cell(row[key], *form) for key, _, *form in _COLUMNS)]
+        for name, row in (*values["conditions"].items(), (POOLED, values[POOLED]))
+    ]
+    title = (
         f"objects looked for, {values['objects']} in number: {values['scenes']} scenes with them, "
         f"{values['empty_scenes']} without"
     )
-    table.padding = 0  # the lines between columns are blanks, and 80 columns have to do
-    table.add_column("scenes")
-    for _, heading, _, _ in _COLUMNS:
-        table.add_column(heading, justify="right")
-    for name, row in _rows(values):
-        if name == POOLED:
-            table.add_section()
-        table.add_row(name, *(_cell(row[key], *form) for key, _, *form in _COLUMNS))
-    return table
+    headings = ["scenes", *(heading for _, heading, _, _ in _COLUMNS)]
+    return table(title, headings, [*rows[:-1], [], rows[-1]], padding=TIGHT)
 
 
 def methods_table(values: dict[str, Any]) -> Table:
     """Right places of every method at the same rate of false alarms."""
-    methods: dict[str, Any] = values["methods"]
-    table = plain_table(
+    methods = [*values["methods"].values()]
+    rows: list[list[object]] = [
+        [_plain(name), *(_with_interval(one["conditions"][name], "right_place") for one in methods)]
+        for name in methods[0]["conditions"]
+    ]
+    rows += [[], [POOLED, *(_with_interval(one[POOLED], "right_place") for one in methods)]]
+    for label, key, factor, digits in _METHOD_ROWS:
+        rows.append([label, *(_cell(one[POOLED][key], factor, digits) for one in methods)])
+    rows.append(["ms per scene", *(_cell(one["seconds_per_scene"], 1000, 0) for one in methods)])
+    title = (
         f"right place [%], every method at its threshold for {100 * values['rate']:.0f} % "
         f"false alarms"
     )
-    table.padding = 0
-    table.add_column("scenes")
-    for name in methods:
-        table.add_column(Text(name), justify="right")
-    names = [*next(iter(methods.values()))["conditions"], POOLED]
-    for name in names:
-        rows = [m[POOLED] if name == POOLED else m["conditions"][name] for m in methods.values()]
-        if name == POOLED:
-            table.add_section()
-        table.add_row(_plain(name), *(_with_interval(row, "right_place") for row in rows))
-    for label, key, factor, digits in _METHOD_ROWS:
-        cells = [_cell(m[POOLED][key], factor, digits) for m in methods.values()]
-        table.add_row(Text(label), *cells)
-    times = [_cell(m["seconds_per_scene"], 1000, 0) for m in methods.values()]
-    table.add_row("ms per scene", *times)
-    return table
+    return table(title, ["scenes", *values["methods"]], rows, padding=TIGHT)
 
 
 _METHOD_ROWS = (
@@ -209,20 +204,15 @@ _METHOD_ROWS = (
 )
 
 
-def difference_lines(values: dict[str, Any]) -> list[Text]:
-    """How much more often the first method is right, on the very same scenes."""
-    first, *_ = values["at_false_alarm_rate"]["methods"]
-    return [
-        Text(f"{first} minus {name}: {difference_text(difference)}")
-        for name, difference in values["at_false_alarm_rate"]["right_place_minus"].items()
-    ]
-
-
-def difference_text(difference: dict[str, Any]) -> str:
-    """A difference in right places with its interval, in points of a hundred."""
-    low, high = difference["interval_95"]
-    value = 100 * difference["difference"]
-    return f"{value:+.1f} points right place ({100 * low:+.1f} to {100 * high:+.1f})"
+def difference_lines(levelled: dict[str, Any]) -> list[Text]:
+    """How much more often the first method is right, on the very same scenes, in points of 100."""
+    first, *_ = levelled["methods"]
+    lines = []
+    for name, row in levelled["right_place_minus"].items():
+        value, low, high = (100 * one for one in (row["difference"], *row["interval_95"]))
+        points = f"{value:+.1f} points right place ({low:+.1f} to {high:+.1f})"
+        lines.append(Text(f"{first} minus {name}: {points}"))
+    return lines
 
 
 def intervals_line(values: dict[str, Any]) -> str:
@@ -238,31 +228,17 @@ def intervals_line(values: dict[str, Any]) -> str:
     return f"pooled, 95 % intervals: {', '.join(texts)}; fallback ran in {fallback} %"
 
 
-def _rows(values: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    rows = [(_plain(name), row) for name, row in values["conditions"].items()]
-    return [*rows, (POOLED, values[POOLED])]
-
-
 def _plain(name: Condition | str) -> str:
     return name.replace("_", " ")
 
 
 def _cell(value: float | None, factor: float, digits: int) -> str:
-    return "-" if value is None else f"{factor * value:.{digits}f}"
+    return DASH if value is None else f"{factor * value:.{digits}f}"
 
 
 def _with_interval(row: dict[str, Any], key: str) -> str:
     low, high = row[f"{key}_95"]
     return f"{_cell(row[key], 100, 1)} ({_cell(low, 100, 0)}-{_cell(high, 100, 0)})"
-
-
-def _difference_json(
-    mine: np.ndarray[Any, np.dtype[np.bool_]],
-    theirs: np.ndarray[Any, np.dtype[np.bool_]],
-    seed: int,
-) -> dict[str, Any]:
-    difference, (low, high) = paired_difference(mine, theirs, seed)
-    return {"difference": number(difference, 4), "interval_95": [number(low, 4), number(high, 4)]}
 
 
 def _median_seconds(results: Sequence[Judged]) -> float | None:

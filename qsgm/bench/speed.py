@@ -1,9 +1,8 @@
 """Seconds per stage of the whole job, in processes of their own, next to the same job in torch.
 
 Every variant runs several times, in turns, so that whatever else the machine does hits all of
-them; medians are reported. Single steps and forward passes, too short for that, take turns in one
-process a few hundred times, next to those of other frameworks (:mod:`qsgm.bench.peers_table`).
-Ratios are what can be compared between machines.
+them; medians are reported. Single steps and forward passes, too short for that, take turns in this
+process a few hundred times. Ratios are what can be compared between machines.
 """
 
 import importlib.util
@@ -21,23 +20,14 @@ from typing import Any
 from rich.console import Group, RenderableType
 
 from qsgm import defaults
-from qsgm.bench.peers_table import (
-    OWN_STEP,
-    OWN_STEPS,
-    StepPlan,
-    StepTimes,
-    measure_steps,
-    render_steps,
-    steps_json,
-)
-from qsgm.bench.step_jobs import check_steps
+from qsgm.bench.timing import check_steps, step_seconds
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
 from qsgm.grasp.crops import TRAIN_CROPS
-from qsgm.tune.loop import BATCH
-from qsgm.tune.prepare import Watch
-from qsgm.tune.report import number, plain_table
-from qsgm.tune.settings import Settings, trunk_precision
+from qsgm.progress import Progress
+from qsgm.schedule import BATCH
+from qsgm.tables import number, numbers, table
+from qsgm.tune.settings import Settings
 
 VARIANTS: Mapping[str, Sequence[str]] = {
     "sgm int8": ("--method", "sgm", "--int8"),
@@ -46,6 +36,9 @@ VARIANTS: Mapping[str, Sequence[str]] = {
 }
 TORCH = "torch bp"
 STAGES = ("crops", "features", "tuning", "total", "process")
+TURNS = 400  # of each kind of step, and of a forward pass, in every repeat
+OWN_STEP = f"sgm_{defaults.PRECISION}"  # that others are compared with
+STEPS = {"forward": "forward", "sgm_int8": "sgm int8", "sgm_float": "sgm float", "backprop": "bp"}
 
 Seconds = dict[str, float]
 
@@ -55,46 +48,47 @@ def measure_speed(
     bundle: Bundle,
     settings: Settings,
     repeats: int,
-    watch: Watch,
-    plan: StepPlan = OWN_STEPS,
+    watch: Progress,
+    thread_counts: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Medians of all variants and the ratios between them; torch where it is installed.
 
-    `plan` says which other frameworks' steps to measure; without one, none.
+    `thread_counts` are further ones of single steps.
     """
     check_steps(bundle, settings.layers)
     medians = measure_jobs(frame, bundle, settings, repeats, watch)
-    times = measure_steps(frame, bundle, settings.layers, settings.threads, repeats, plan, watch)
+    counts = sorted({settings.threads, *thread_counts})
+    times = measure_steps(bundle, settings.layers, counts, repeats, watch)
     steps = settings.epochs * -(-TRAIN_CROPS // BATCH)
-    turns = times.own[settings.threads]
+    turns = times[settings.threads]
     return {
         "frame": str(frame),
         "bundle": str(bundle.folder),
         "layers": settings.layers,
-        "trunk": trunk_precision(settings, bundle),
+        "trunk": settings.trunk or bundle.manifest.trunk,
         "epochs": settings.epochs,
         "threads": settings.threads,
         "repeats": repeats,
         "steps": steps,
-        "seconds": {
-            name: {stage: number(value, 4) for stage, value in stages.items()}
-            for name, stages in medians.items()
-        },
+        "seconds": {name: numbers(stages, 4) for name, stages in medians.items()},
         "step_ms": {
             name: number(1000 * stages["tuning"] / steps, 4) for name, stages in medians.items()
         },
-        "in_turns_ms": {name: number(1000 * value, 4) for name, value in turns.items()},
-        "ratios": ratios(medians, turns) | peer_ratios(times, settings.threads),
-        **steps_json(times),
+        "in_turns_ms": in_ms(turns),
+        "ratios": ratios(medians, turns),
+        "step_table_ms": {str(count): in_ms(some) for count, some in times.items()},
+        "step_over_qsgm_step": {
+            str(count): {name: number(value / some[OWN_STEP], 3) for name, value in some.items()}
+            for count, some in times.items()
+        },
     }
 
 
 def measure_jobs(
-    frame: Path, bundle: Bundle, settings: Settings, repeats: int, watch: Watch
+    frame: Path, bundle: Bundle, settings: Settings, repeats: int, watch: Progress
 ) -> dict[str, Seconds]:
     """Median seconds per stage of whole jobs, by variant."""
-    with_torch = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
-    variants = [*VARIANTS, TORCH] if with_torch else [*VARIANTS]
+    variants = variants_here()
     runs: dict[str, list[Seconds]] = {name: [] for name in variants}
     for repeat in range(repeats):
         for done, name in enumerate(variants, start=1):
@@ -104,6 +98,32 @@ def measure_jobs(
         name: {stage: median(run[stage] for run in some) for stage in STAGES}
         for name, some in runs.items()
     }
+
+
+def variants_here() -> list[str]:
+    """All variants of a job; torch's where it is installed."""
+    with_torch = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
+    return [*VARIANTS, TORCH] if with_torch else [*VARIANTS]
+
+
+def measure_steps(
+    bundle: Bundle, layers: int, counts: Sequence[int], repeats: int, watch: Progress
+) -> dict[int, Seconds]:
+    """Median seconds of single steps, by number of threads and variant."""
+    turns: dict[int, list[Seconds]] = {count: [] for count in counts}
+    for repeat in range(repeats):
+        for done, (count, some) in enumerate(turns.items(), start=1):
+            some.append(step_seconds(bundle, layers, TURNS, count))
+            watch("steps", repeat * len(counts) + done, repeats * len(counts))
+    return {
+        count: {name: median(turn[name] for turn in some) for name in some[0]}
+        for count, some in turns.items()
+    }
+
+
+def in_ms(seconds: Seconds) -> dict[str, float | None]:
+    """Milliseconds as JSON has them."""
+    return {name: number(1000 * value, 4) for name, value in seconds.items()}
 
 
 def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | None]:
@@ -127,17 +147,7 @@ def ratios(medians: Mapping[str, Seconds], turns: Seconds) -> dict[str, float | 
             "torch_features_over_qsgm_features": other["features"] / own["features"],
             "torch_process_over_qsgm_process": other["process"] / own["process"],
         }
-    return {name: number(value, 3) for name, value in found.items()}
-
-
-def peer_ratios(times: StepTimes, threads: int) -> dict[str, float | None]:
-    """Each other framework's step over this one's, all of SGD."""
-    steps = times.seconds(threads)
-    return {
-        f"{name}_step_over_qsgm_step": number(steps[name] / steps[OWN_STEP], 3)
-        for name in steps
-        if name not in times.own[threads]
-    }
+    return numbers(found, 3)
 
 
 def run_once(
@@ -153,11 +163,19 @@ def run_once(
     )
     with tempfile.TemporaryDirectory() as home:
         if name == TORCH:
-            job = ["qsgm.train.torchjob", str(frame), str(folder), layers, epochs, seed, threads]
+            job = [
+                "qsgm.train.grasp.torch_job",
+                str(frame),
+                str(folder),
+                layers,
+                epochs,
+                seed,
+                threads,
+            ]
         else:
             job = ["qsgm.cli", "finetune", "--json", "-o", f"{home}/object", *VARIANTS[name]]
             job += ["--layers", layers, "--epochs", epochs, "--seed", seed, "--threads", threads]
-            job += ["--trunk", trunk_precision(settings, bundle), "--bundle", str(folder)]
+            job += ["--trunk", settings.trunk or bundle.manifest.trunk, "--bundle", str(folder)]
             job += ["--", str(frame)]
         began = time.perf_counter()
         done = subprocess.run(
@@ -176,20 +194,26 @@ def run_once(
 
 
 def render(report: Mapping[str, Any]) -> RenderableType:
-    """Seconds per stage and variant, and the ratios below them."""
-    table = plain_table(
+    """Seconds per stage and variant, the ratios below them, and single steps by threads."""
+    jobs = table(
         f"seconds, median of {report['repeats']}: last {report['layers']} layers, "
-        f"{report['steps']} steps, threads: {report['threads']}"
+        f"{report['steps']} steps, threads: {report['threads']}",
+        ["", *((stage, "{:.2f}") for stage in STAGES), ("ms a step", "{:.3f}")],
+        [
+            [name, *stages.values(), report["step_ms"][name]]
+            for name, stages in report["seconds"].items()
+        ],
     )
-    table.add_column("")
-    for stage in STAGES:
-        table.add_column(stage, justify="right")
-    table.add_column("ms a step", justify="right")
-    for name, stages in report["seconds"].items():
-        cells = [f"{stages[stage]:.2f}" for stage in STAGES]
-        table.add_row(name, *cells, f"{report['step_ms'][name]:.3f}")
-    quotients = plain_table("ratios")
+    rows = [[name.replace("_", " "), value] for name, value in report["ratios"].items()]
+    quotients = table("ratios", ["", ("", "{:.2f}")], rows)
     quotients.show_header = False
-    for name, value in report["ratios"].items():
-        quotients.add_row(name.replace("_", " "), f"{value:.2f}")
-    return Group(table, quotients, render_steps(report))
+    columns: list[str | tuple[str, str]] = [""]
+    for count in report["step_table_ms"]:
+        columns += [(f"threads: {count}", "{:.3f}"), ("/", "{:.2f}")]
+    tables = report["step_table_ms"], report["step_over_qsgm_step"]
+    rows = [
+        [name, *(some[count][key] for count in tables[0] for some in tables)]
+        for key, name in STEPS.items()
+    ]
+    title = f"a training step, batch {BATCH}: ms, and over the {STEPS[OWN_STEP]} step"
+    return Group(jobs, quotients, table(title, columns, rows))

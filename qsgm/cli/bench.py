@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,8 +23,6 @@ from qsgm.cli.options import (
     SeedOption,
     ThreadsOption,
     TrunkOption,
-    parsed_blocks,
-    parsed_interpreters,
     parsed_layer_counts,
     parsed_run_lengths,
     parsed_thread_counts,
@@ -82,11 +80,10 @@ def bench_accuracy(
     backpropagation with the optimizer and rate of a small grid that do best on these very frames:
     more than any user could know beforehand.
     """
-    from qsgm.bench.accuracy import measure_accuracy
-    from qsgm.bench.accuracy_report import accuracy_report_json, render
+    from qsgm.bench.accuracy import measure_accuracy, render, report_json
     from qsgm.tune.settings import Settings
 
-    charts = None if pictures is None else host_module("qsgm.train.charts")
+    check_picture(pictures)
     lengths = parsed_run_lengths(short)
     some = frames_of(frames, limit)
     settings = Settings(
@@ -94,45 +91,12 @@ def bench_accuracy(
     )
     with progress() as watch:
         report = measure_accuracy(some, open_bundle(bundle), settings, lengths, watch)
-    values = accuracy_report_json(report)
-    show(values, render(report, per_frame), as_json)
+    values = report_json(report)
+    show(values, render(values, per_frame), as_json)
     write_report(values, output)
-    if pictures is not None and charts is not None:
-        charts.write_learning_curves(report, pictures / "learning_curves.png")
+    if pictures is not None:
+        draw("learning_curves", values, pictures / "learning_curves.png")
         write_report(values, pictures / "accuracy.json")
-
-
-@app.command("layers")
-def bench_layers(
-    frames: FramesOption = None,
-    blocks: Annotated[
-        list[str] | None,
-        typer.Option(metavar="A-B,C", help="Layers in groups; repeatable. Else: all singles."),
-    ] = None,
-    int8: PrecisionOption = None,
-    optimizer: OptimizerOption = None,
-    epochs: EpochsOption = defaults.EPOCHS,
-    limit: LimitOption = None,
-    seed: SeedOption = 0,
-    bundle: BundleOption = None,
-    output: ReportOption = None,
-    threads: ThreadsOption = 1,
-    as_json: JsonOption = False,
-) -> None:
-    """Static SGMs with more and more layers tuned, or in the blocks given, on every frame."""
-    from qsgm.bench.layers import measure_layers
-
-    some = frames_of(frames, limit)
-    loaded = open_bundle(bundle)
-    asked = blocks or [text for text in loaded.blocks if "-" not in text]
-    divisions = [parsed_blocks(text) for text in asked]
-    settings = settings_of(
-        int8, MethodName.SGM, defaults.LAYERS, optimizer, epochs, seed, None, threads
-    )
-    with progress() as watch:
-        report = measure_layers(some, loaded, settings, divisions, watch)
-    show(report.to_json(), report.render(), as_json)
-    write_report(report.to_json(), output)
 
 
 @app.command("scenes")
@@ -187,16 +151,17 @@ def bench_scenes(
     `benchmarks/rivals` shows.
     """
     from qsgm.bench.composing import CONDITIONS
+    from qsgm.bench.scenes_report import render
     from qsgm.bench.scenes_run import SceneJob, run_scenes
 
     parsed = tuple(parsed_rival(text) for text in rivals or [])
-    settings = settings_of(int8, method, layers, optimizer, epochs, seed, None, threads)
+    settings = settings_of(int8, method, layers, optimizer, epochs, seed, threads)
     loaded = open_bundle(bundle)
     asked = tuple(name for name in CONDITIONS if name in (conditions or CONDITIONS))
     job = SceneJob(frames, limit, asked, scenes, settings, loaded, parsed, keep, output)
     with progress() as watch:
-        values, tables = run_scenes(job, watch)
-    show(values, tables, as_json)
+        values = run_scenes(job, watch)
+    show(values, render(values), as_json)
 
 
 @app.command("speed")
@@ -208,17 +173,9 @@ def bench_speed(
         int, typer.Option(min=1, max=10_000, help="Passes over 800 crops.")
     ] = defaults.EPOCHS,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of every variant.")] = 5,
-    peers: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--peer",
-            metavar="NAME=PYTHON",
-            help="Python that has onnxruntime-training or executorch; repeatable.",
-        ),
-    ] = None,
     thread_counts: Annotated[
         str,
-        typer.Option(metavar="N,N", help="Of single steps, here and elsewhere; '' for none."),
+        typer.Option(metavar="N,N", help="Further ones, of single steps; '' for none."),
     ] = defaults.THREAD_COUNTS,
     seed: SeedOption = 0,
     bundle: BundleOption = None,
@@ -228,20 +185,18 @@ def bench_speed(
 ) -> None:
     """Seconds per stage on the first frame, next to the same job in torch if it is installed.
 
-    Single steps stand next to those of torch, torch.compile, onnxruntime-training and executorch.
-    The last two need a Python of their own; what is missing is said, and the rest measured.
+    `benchmarks/peers` compares single steps with those of other frameworks.
     """
-    from qsgm.bench.peers_table import StepPlan
     from qsgm.bench.speed import measure_speed, render
     from qsgm.tune.settings import Settings
 
-    plan = StepPlan(parsed_thread_counts(thread_counts), parsed_interpreters(peers or []))
+    counts = parsed_thread_counts(thread_counts)
     frame = frames_of(frames, 1)[0].path
     settings = Settings(
         layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
     )
     with progress() as watch:
-        report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch, plan)
+        report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch, counts)
     write_report(report, output)
     show(report, render(report), as_json)
 
@@ -255,12 +210,12 @@ def bench_resources(
     as_json: JsonOption = False,
 ) -> None:
     """Operations, bytes and time of layers and SGMs: the paper's Table 3, and this bundle's."""
-    from qsgm.bench.resources import measure_resources
+    from qsgm.bench.resources import measure_resources, render
 
     with progress() as watch:
-        report = measure_resources(open_bundle(bundle), repeats, threads, watch)
-    write_report(report.to_json(), output)
-    show(report.to_json(), report.render(), as_json)
+        values = measure_resources(open_bundle(bundle), repeats, threads, watch)
+    write_report(values, output)
+    show(values, render(values), as_json)
 
 
 @app.command("memory")
@@ -282,47 +237,21 @@ def bench_memory(
     as_json: JsonOption = False,
 ) -> None:
     """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
-    from qsgm.bench.memory import measure_memory
+    from qsgm.bench.memory import measure_memory, render
     from qsgm.tune.settings import Settings
 
     lengths = parsed_layer_counts(processes)
-    host = host_module("qsgm.train.liveness")
-    chart = None if picture is None else host_module("qsgm.train.memory_chart")
+    host = host_module("qsgm.train.graphs.memory")
+    check_picture(picture)
     frame = frames_of(frames, 1)[0].path
     settings = Settings(trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
-        report = measure_memory(
+        values = measure_memory(
             frame, open_bundle(bundle), settings, lengths, host.step_memory, watch
         )
-    write_report(report.to_json(), output)
-    if picture is not None and chart is not None:
-        chart.write_memory_chart(report, picture)
-    show(report.to_json(), report.render(), as_json)
-
-
-@app.command("growth")
-def bench_growth(
-    frames: FramesOption = None,
-    repeats: Annotated[int, typer.Option(min=1, max=10_000, help="Turns of every variant.")] = 100,
-    bundle: BundleOption = None,
-    output: ReportOption = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw the growth, a PNG (matplotlib).")
-    ] = None,
-    threads: ThreadsOption = 1,
-    as_json: JsonOption = False,
-) -> None:
-    """A step's time by batch, layers and width, a job's by its crops; where int8 wins (host)."""
-    host = host_module("qsgm.train.growth")
-    chart = None if picture is None else host_module("qsgm.train.growth_chart")
-    frame = frames_of(frames, 1)[0]
-    sizes = host.Sizes(repeats=repeats)
-    with progress() as watch:
-        report = host.measure_growth(frame, open_bundle(bundle), threads, sizes, watch)
-    write_report(report.to_json(), output)
-    if picture is not None and chart is not None:
-        chart.write_growth_chart(report, picture)
-    show(report.to_json(), report.render(), as_json)
+    write_report(values, output)
+    draw("memory", values, picture)
+    show(values, render(values), as_json)
 
 
 @app.command("fidelity")
@@ -340,15 +269,15 @@ def bench_fidelity(
     as_json: JsonOption = False,
 ) -> None:
     """int8 gradients against float and true ones along a run on every frame, worst cases named."""
-    from qsgm.bench.fidelity import measure_fidelity
+    from qsgm.bench.fidelity import measure_fidelity, render
     from qsgm.tune.settings import Settings
 
     some = frames_of(frames, limit)
     settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
-        report = measure_fidelity(some, open_bundle(bundle), settings, watch)
-    write_report(report.to_json(), output)
-    show(report.to_json(), report.render(), as_json)
+        values = measure_fidelity(some, open_bundle(bundle), settings, watch)
+    write_report(values, output)
+    show(values, render(values), as_json)
 
 
 @app.command("calibration")
@@ -377,49 +306,21 @@ def bench_calibration(
     as_json: JsonOption = False,
 ) -> None:
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
-    from qsgm.bench.calibration import VARIANTS, measure_calibration
+    from qsgm.bench.calibration import VARIANTS, measure_calibration, render
     from qsgm.bench.frames import list_frames
     from qsgm.tune.settings import Settings
 
-    chart = None if picture is None else host_module("qsgm.train.calibration_chart")
+    check_picture(picture)
     folder = paths.calibration_folder(calib)
     some = list_frames(frames, limit)
     settings = Settings(epochs=epochs, seed=seed, threads=threads)
     chosen = [parsed_variant(text) for text in variants] if variants else VARIANTS
     with progress() as watch:
         report = measure_calibration(some, folder, open_bundle(bundle), settings, watch, chosen)
-    write_report(report.to_json(), output)
-    if picture is not None and chart is not None:
-        chart.write_calibration_chart(report, picture)
-    show(report.to_json(), report.render(), as_json)
-
-
-@app.command("baselines")
-def bench_baselines(
-    checkpoint: Annotated[
-        Path, typer.Argument(metavar="sgm.pt", help="Gives the start and the static SGMs.")
-    ],
-    frames: FramesOption = None,
-    layers: Annotated[int, typer.Option(min=2, max=4, help="How many to tune.")] = defaults.LAYERS,
-    epochs: EpochsOption = defaults.EPOCHS,
-    limit: LimitOption = None,
-    seed: SeedOption = 0,
-    output: ReportOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Other systems on the same crops: online SGMs, feedback alignment, target projection (host).
-
-    All in float and in torch, each at the best of a few optimizers and rates on these frames.
-    """
-    host = host_module("qsgm.train.baselines.comparison")
-    loaded = host_module("qsgm.train.checkpoint").load_checkpoint(checkpoint)
-    some = frames_of(frames, limit)
-    with progress() as watch:
-        tasks = host.tasks_of(loaded, some, layers, seed, watch)
-        rows = host.compare(loaded, tasks, layers, epochs, seed, watch)
-    values = host.to_json(rows, len(some), epochs)
-    show(values, host.render(rows, len(some)), as_json)
+    values = report.to_json()
     write_report(values, output)
+    draw("calibration", values, picture)
+    show(values, render(values), as_json)
 
 
 @app.command("paper")
@@ -444,6 +345,20 @@ def bench_paper(
         results = experiment.measure_paper(config, seed, watch)
     write_report(host.to_json(results), output)
     show(host.to_json(results), host.render(results), as_json)
+
+
+def check_picture(path: Path | None) -> None:
+    """Raise QsgmError where a picture is asked for that cannot be drawn, before hours of work."""
+    if path is not None:
+        host_module("matplotlib")
+
+
+def draw(chart: str, values: dict[str, Any], path: Path | None) -> None:
+    """Write one of the charts of :mod:`qsgm.bench.charts` as a PNG file, if it was asked for."""
+    from qsgm.bench import charts
+
+    if path is not None:
+        charts.write_chart(getattr(charts, chart)(values), path)
 
 
 def frames_of(folder: Path | None, limit: int | None) -> list["BenchFrame"]:

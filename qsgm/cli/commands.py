@@ -291,7 +291,8 @@ def fidelity(
     """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
     from qsgm.tune.report import fidelity_command_json, fidelity_command_report
 
-    chart = None if picture is None else host_module("qsgm.train.fidelity_chart")
+    if picture is not None:
+        host_module("matplotlib")
     settings = settings_of(
         int8, MethodName.SGM, layers, optimizer, epochs, seed, threads, trunk=trunk
     )
@@ -303,8 +304,10 @@ def fidelity(
             "there is nothing to compare; export it again with `qsgm fold-and-quantize`"
         )
     report = fidelity_command_json(result, frame.stem)
-    if picture is not None and chart is not None:
-        chart.write_fidelity_chart(result, frame.stem, picture)
+    if picture is not None:
+        from qsgm.bench.charts import fidelity_over_run, write_chart
+
+        write_chart(fidelity_over_run(report), picture)
     write_report(report, output)
     show(report, fidelity_command_report(result), as_json)
     if picture is not None and not as_json:

@@ -273,16 +273,6 @@ def parsed_thread_counts(text: str) -> tuple[int, ...]:
     return counts
 
 
-def parsed_interpreters(texts: list[str]) -> dict[str, Path]:
-    """Pythons of other frameworks, such as executorch=/opt/et/bin/python."""
-    from qsgm.bench.peers import parse_interpreters
-
-    try:
-        return parse_interpreters(texts)
-    except QsgmError as error:
-        raise typer.BadParameter(str(error), param_hint="'--peer'") from error
-
-
 def numbers(text: str) -> tuple[int, ...]:
     """Whole numbers between commas; a lone 0, which no option takes, for what is none."""
     try:

@@ -7,24 +7,19 @@ SGD it has knows no momentum, so that its step does less than the others'.
 """
 
 import importlib
-import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime as ort
 from onnx import numpy_helper, parser
+from steps import Step, tell, timed_steps
 
-# Features (B, C, H, W) and labels (B, 3) of a batch to its loss; updates the weights.
-Step = Callable[[Any, Any], float]
-WARM_UP = 5  # first steps, in which things are allocated
-CHECKED_STEPS = 20  # whose losses are printed
 TRAINING = ("onnxruntime.training.artifacts", "onnxruntime.training.api")
 
 # The softplus of a logit is minus the logarithm of the sigmoid of its opposite, whose operators
@@ -133,21 +128,6 @@ def training_step(data: Mapping[str, Any], threads: int, home: Path) -> Step:
     return step
 
 
-def timed_steps(
-    step: Step, data: Mapping[str, Any], seconds: float
-) -> tuple[list[float], list[float]]:
-    """Losses and seconds of steps on one batch after the other, for so long at most."""
-    losses: list[float] = []
-    times: list[float] = []
-    for batch in data["rows"]:
-        if len(times) >= WARM_UP + CHECKED_STEPS and sum(times[WARM_UP:]) > seconds:
-            break
-        began = time.perf_counter()
-        losses.append(step(data["features"][batch], data["labels"][batch]))
-        times.append(time.perf_counter() - began)
-    return losses, times
-
-
 def main() -> None:
     """Run once and print what came of it."""
     path, threads, seconds = sys.argv[1:]
@@ -158,18 +138,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as home:
         step = training_step(data, int(threads), Path(home))
         built = time.perf_counter() - began
-        losses, times = timed_steps(step, data, float(seconds))
-    result = {
-        "version": ort.__version__,
-        "optimizer": "SGD without momentum",
-        "imported_at": imported_at,  # seconds since the epoch
-        "setup_seconds": built + sum(times[:WARM_UP]),
-        "steps": len(times) - WARM_UP,
-        "step_seconds": median(times[WARM_UP:]),
-        "total_seconds": sum(times[WARM_UP:]),
-        "losses": losses[:CHECKED_STEPS],
-    }
-    sys.stdout.write(json.dumps(result) + "\n")
+        arrays = (data[name] for name in ("features", "labels", "rows"))
+        tell(ort.__version__, imported_at, built, *timed_steps(step, *arrays, float(seconds)))
 
 
 if __name__ == "__main__":

@@ -6,24 +6,19 @@ prints one JSON object. The data are those of step_data.py. Nothing of qsgm is i
 """
 
 import importlib
-import json
 import sys
 import time
 from collections.abc import Callable, Mapping
 from importlib import metadata
-from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
+from steps import Step, tell, timed_steps
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# Features (B, C, H, W) and labels (B, 3) of a batch to its loss; updates the weights.
-Step = Callable[[Tensor, Tensor], float]
 KINDS = ("weight", "bias")
-WARM_UP = 5  # first steps, in which things are compiled and allocated
-CHECKED_STEPS = 20  # whose losses are printed
 EXECUTORCH = ("executorch.exir", "executorch.extension.training")
 
 
@@ -133,22 +128,6 @@ def executorch_step(data: Mapping[str, Any], threads: int) -> Step:
 STEPS = {"eager": eager_step, "compile": compiled_step, "executorch": executorch_step}
 
 
-def timed_steps(
-    step: Step, data: Mapping[str, Any], seconds: float
-) -> tuple[list[float], list[float]]:
-    """Losses and seconds of steps on one batch after the other, for so long at most."""
-    features, labels = (torch.from_numpy(data[name]) for name in ("features", "labels"))
-    losses: list[float] = []
-    times: list[float] = []
-    for batch in torch.from_numpy(data["rows"]):
-        if len(times) >= WARM_UP + CHECKED_STEPS and sum(times[WARM_UP:]) > seconds:
-            break
-        began = time.perf_counter()
-        losses.append(step(features[batch], labels[batch]))
-        times.append(time.perf_counter() - began)
-    return losses, times
-
-
 def main() -> None:
     """Run once and print what came of it."""
     name, path, threads, seconds = sys.argv[1:]
@@ -158,18 +137,9 @@ def main() -> None:
     data = dict(np.load(path))
     step = STEPS[name](data, int(threads))
     built = time.perf_counter() - began
-    losses, times = timed_steps(step, data, float(seconds))
-    result = {
-        "version": metadata.version("executorch" if name == "executorch" else "torch"),
-        "optimizer": f"SGD, momentum {float(data['momentum']):.1f}",
-        "imported_at": imported_at,  # seconds since the epoch
-        "setup_seconds": built + sum(times[:WARM_UP]),
-        "steps": len(times) - WARM_UP,
-        "step_seconds": median(times[WARM_UP:]),
-        "total_seconds": sum(times[WARM_UP:]),
-        "losses": losses[:CHECKED_STEPS],
-    }
-    sys.stdout.write(json.dumps(result) + "\n")
+    arrays = (torch.from_numpy(data[name]) for name in ("features", "labels", "rows"))
+    version = metadata.version("executorch" if name == "executorch" else "torch")
+    tell(version, imported_at, built, *timed_steps(step, *arrays, float(seconds)))
 
 
 if __name__ == "__main__":
