@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
+from qsgm.train.model.start import folded_start
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -22,10 +24,8 @@ from torch.nn import functional as F
 
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.grasp.objects import draw_frame
-from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
 from qsgm.train.model.local import LayerState, columns, layer_forward, true_gradients
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.paper.baselines.backpropagation import Backpropagation
 from qsgm.train.paper.baselines.tuning import Recipe, adam, run_baseline, sgd
 from qsgm.train.pretraining.evaluate import UpdateRule, fine_tune, score

@@ -11,14 +11,14 @@ import sys
 from pathlib import Path
 
 import torch
+from qsgm.train.model.graspnet import LAYERS
+from qsgm.train.model.start import folded_start
 from rich.console import Console
 from rich.table import Table
 from torch.nn.functional import cosine_similarity
 
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.model.graspnet import LAYERS
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.pretraining.matching import Examples, MatchingConfig, fit_sgm, record_examples
 from qsgm.train.pretraining.tasks import draw_tasks
 from qsgm.tune.loop import BATCH
