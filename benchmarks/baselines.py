@@ -73,7 +73,7 @@ def all_systems(checkpoint: Checkpoint, tuned: int) -> dict[str, Callable[[int],
     trained = {k: sgm for k, sgm in checkpoint.sgms.items() if k in network.last(tuned)}
     torch.manual_seed(0)
     random = {layer: Sgm(network, layer, sgm.hidden).eval() for layer, sgm in trained.items()}
-    feedback, projections = random_feedback(start, 0), random_projections(0)
+    feedback, projections = random_feedback(network, start, 0), random_projections(network, 0)
     return {
         "backpropagation": lambda _: Backpropagation(),
         "static SGMs": lambda _: StaticSgms(trained),

@@ -16,11 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import LAYERS, GraspNet, Loss
+from qsgm.schedule import MOMENTUM
+from qsgm.task import Heads, Task
+from qsgm.train.heads import per_sample
+from qsgm.train.model.fold import folded_start
+from qsgm.train.model.net import ConvNet, maps_of
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
-from qsgm.train.pretraining.evaluate import score
-from qsgm.train.pretraining.maml import MOMENTUM
+from qsgm.train.pretraining.evaluate import Score, score
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
 RATE = 1e-1  # paper section 4.2: of network and SGMs, in pretraining and fine-tuning
@@ -33,7 +35,7 @@ class CutPass:
 
     outputs: Mapping[int, Tensor]  # (N, C, H, W), each with its own layer's graph
     true: Mapping[int, Tensor]  # gradient of the summed loss on each output
-    labels: Tensor  # (N, 3)
+    labels: Tensor  # (N, L)
 
 
 class Driver(Protocol):
@@ -78,16 +80,16 @@ class FixedSgms:
         return {layer: self.sgms[layer](x, seen.labels) for layer, x in _hidden(seen).items()}
 
 
-def cut_pass(layers: Mapping[int, nn.Module], x: Tensor, labels: Tensor, loss: Loss) -> CutPass:
+def cut_pass(layers: Mapping[int, nn.Module], x: Tensor, labels: Tensor, heads: Heads) -> CutPass:
     """Run the last layers on maps (N, C, H, W) and carry the true gradients back."""
     inputs: dict[int, Tensor] = {}
     outputs: dict[int, Tensor] = {}
     for number, layer in layers.items():
         inputs[number] = x.detach().requires_grad_()
         x = outputs[number] = layer(inputs[number])
-    total = loss.per_sample(x[:, :, 0, 0], labels).sum()
+    total = per_sample(heads, x[:, :, 0, 0], labels).sum()
     (gradient,) = torch.autograd.grad(total, x, retain_graph=True)
-    true = {LAYERS: gradient}
+    true = {[*layers][-1]: gradient}
     for number in list(layers)[:0:-1]:
         (gradient,) = torch.autograd.grad(
             outputs[number], inputs[number], gradient, retain_graph=True
@@ -103,7 +105,8 @@ def driven_step(
     optimizer: torch.optim.Optimizer,
 ) -> None:
     """Update every layer by the driver's gradients, the last one by the loss's own."""
-    given = {**driver.gradients(seen), LAYERS: seen.true[LAYERS]}
+    last = [*layers][-1]
+    given = {**driver.gradients(seen), last: seen.true[last]}
     optimizer.zero_grad()
     for number, layer in layers.items():
         own = list(layer.parameters())  # no further: what lies before is cut off
@@ -112,9 +115,19 @@ def driven_step(
 
 
 def tune_with_batchnorm(
-    net: GraspNet, tuned: int, driver: Driver, tasks: TaskSet, epochs: int, loss: Loss, seed: int
-) -> Tensor:
-    """Fine-tune a copy of the last layers at a constant 1e-1, batchnorm on batch statistics.
+    net: ConvNet,
+    tuned: int,
+    driver: Driver,
+    tasks: TaskSet,
+    epochs: int,
+    task: Task,
+    seed: int,
+    momentum: float = 0.0,
+) -> Score:
+    """Fine-tune a copy of the last layers by SGD at 1e-1, batchnorm on batch statistics.
+
+    The paper names the rate of fine-tuning and a momentum of 0.9 for pretraining alone. Static
+    SGMs converge without momentum and mostly diverge with it.
 
     Args:
         net: not changed.
@@ -122,34 +135,27 @@ def tune_with_batchnorm(
         driver: where gradients come from.
         tasks: of one object; features are those behind the last frozen layer.
         epochs: passes over the support crops.
-        loss: and with it the angle encoding.
+        task: gives loss and scores.
         seed: of the order of crops.
+        momentum: of SGD.
 
     Returns:
-        (1, 3): objective, detection accuracy and angle error [deg] on the query crops, with
-        batchnorm on its running statistics.
+        The score on the query crops, with batchnorm on its running statistics.
     """
     net = deepcopy(net)
     layers = last_layers(net, tuned)
-    optimizer = torch.optim.SGD(_parameters(layers), RATE, momentum=MOMENTUM)
-    maps = as_maps(tasks.features[0].float())
+    optimizer = torch.optim.SGD(_parameters(layers), RATE, momentum=momentum)
+    first = net.network.last(tuned)[0]
+    maps = maps_of(tasks.features[0].float(), net.network.before(first))
     for rows in shuffled_batches(tasks.support, epochs, seed):
-        seen = cut_pass(layers, maps[rows], tasks.labels[0, rows], loss)
+        seen = cut_pass(layers, maps[rows], tasks.labels[0, rows], task.heads)
         driven_step(layers, seen, driver, optimizer)
-    return score(start_states(folded_start(net.eval(), tuned), 1), tasks, loss)
+    return score(start_states(folded_start(net.eval(), tuned), 1), tasks, task)[0]
 
 
-def last_layers(net: GraspNet, count: int) -> dict[int, nn.Module]:
+def last_layers(net: ConvNet, count: int) -> dict[int, nn.Module]:
     """The last `count` layers by number, ready to train."""
-    numbers = range(LAYERS + 1 - count, LAYERS + 1)
-    return {number: net.layers[number - 1].train() for number in numbers}
-
-
-def as_maps(features: Tensor) -> Tensor:
-    """Features (N, P, C), P a square map, as (N, C, H, W)."""
-    side = round(features.shape[1] ** 0.5)
-    maps: Tensor = features.transpose(1, 2).unflatten(2, (side, side))
-    return maps
+    return {number: net.layers[number - 1].train() for number in net.network.last(count)}
 
 
 def _parameters(layers: Mapping[int, nn.Module]) -> Sequence[nn.Parameter]:
@@ -157,4 +163,4 @@ def _parameters(layers: Mapping[int, nn.Module]) -> Sequence[nn.Parameter]:
 
 
 def _hidden(seen: CutPass) -> Mapping[int, Tensor]:
-    return {layer: x for layer, x in seen.outputs.items() if layer < LAYERS}
+    return {layer: seen.outputs[layer] for layer in [*seen.outputs][:-1]}

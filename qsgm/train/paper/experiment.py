@@ -1,17 +1,15 @@
 """All of it: for every object pretrain on the others, then fine-tune on it by every system."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from torch import Tensor
-
+from qsgm.progress import NO_FIGURES, Progress
 from qsgm.train.paper.objects import OBJECTS, ObjectCrops, cut_object
 from qsgm.train.paper.pretraining import PretrainingSizes, pretrain_without
 from qsgm.train.paper.systems import RATES, all_systems, tune_object
+from qsgm.train.pretraining.evaluate import Score
 from qsgm.train.pretraining.pretrain import one_thread
 
-# (stage, done, of how many)
-Watch = Callable[[str, int, int], None]
 Scores = tuple[float, float, float]  # objective, detection accuracy, angle error [deg]
 
 
@@ -43,7 +41,7 @@ class PaperResults:
         return tuple(self.scores)
 
 
-def measure_paper(config: PaperConfig, seed: int, watch: Watch) -> PaperResults:
+def measure_paper(config: PaperConfig, seed: int, watch: Progress) -> PaperResults:
     """Run everything on one thread; `watch` is told about progress."""
     letters = list(OBJECTS)[: config.objects]
     with one_thread():
@@ -58,13 +56,23 @@ def measure_paper(config: PaperConfig, seed: int, watch: Watch) -> PaperResults:
     return PaperResults(config, seed, scores)
 
 
-def _later(watch: Watch, i: int, of: int) -> Watch:
+def _later(watch: Progress, i: int, of: int) -> Progress:
     """Tells of the i-th of `of` equal parts as of the whole."""
-    return lambda stage, done, total: watch(stage, i * total + done, of * total)
+
+    def later(
+        stage: str, done: int, total: int, figures: Mapping[str, float] = NO_FIGURES, /
+    ) -> None:
+        watch(stage, i * total + done, of * total, figures)
+
+    return later
 
 
 def _measure_object(
-    held_out: str, objects: Mapping[str, ObjectCrops], config: PaperConfig, seed: int, watch: Watch
+    held_out: str,
+    objects: Mapping[str, ObjectCrops],
+    config: PaperConfig,
+    seed: int,
+    watch: Progress,
 ) -> dict[str, dict[str, Scores]]:
     sizes, done = config.pretraining, 0
     steps = sizes.network_steps + sizes.sgm_steps + sizes.four_layer_steps
@@ -79,11 +87,11 @@ def _measure_object(
     scores = {}
     for i, (name, system) in enumerate(systems.items(), start=1):
         found = tune_object(system, objects[held_out], config.epochs, config.rates, seed)
-        scores[name] = {variant: _three(values) for variant, values in found.items()}
+        scores[name] = {variant: _three(score) for variant, score in found.items()}
         watch("tune", i, len(systems))
     return scores
 
 
-def _three(values: Tensor) -> Scores:
-    objective, detection, angle = values.tolist()
-    return objective, detection, angle
+def _three(score: Score) -> Scores:
+    figures = score.scores
+    return score.objective, figures["detection_accuracy"], figures["angle_mae_deg"]

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from qsgm.grasp.crops import cut_crops, label_crops, plan_crops
+from qsgm.grasp.task import GraspTask
 from qsgm.train.grasp.objects import DrawnFrame, draw_frame
-from qsgm.train.model.graspnet import Loss
-from qsgm.train.pretraining.tasks import CENTER_PX, FRAME_HW
+from qsgm.train.grasp.task import CENTER_PX, FRAME_HW
 
 # The paper's label: sine and cosine of an angle in (-90, 90] degrees, not smoothed.
-PAPER_LOSS = Loss(encoding="paper", label_smoothing=0.0)
+PAPER_TASK = GraspTask(encoding="paper", label_smoothing=0.0)
 _SHEET_WINDOW = np.s_[130:350, 190:450]
 _RED = (0, 0, 220)
 
@@ -62,7 +62,7 @@ class ObjectCrops:
 def cut_object(drawn: DrawnFrame, count: int, seed: int) -> ObjectCrops:
     """Plan, cut and label `count` crops of one demonstration."""
     plan = plan_crops(FRAME_HW, CENTER_PX, np.random.default_rng(seed), count)
-    labels = label_crops(plan, encoding=PAPER_LOSS.encoding)
+    labels = label_crops(plan, encoding=PAPER_TASK.encoding)
     return ObjectCrops(torch.from_numpy(cut_crops(drawn.image, plan)), torch.from_numpy(labels))
 
 

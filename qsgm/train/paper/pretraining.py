@@ -18,22 +18,22 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import LAYERS, GraspNet, normalize
+from qsgm.grasp.network import GRASPNET
+from qsgm.schedule import BATCH, MOMENTUM
+from qsgm.train.heads import mean_loss
+from qsgm.train.model.net import ConvNet, as_seen, maps_of
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.paper.baselines.static_sgms import LabelFreeSgm
 from qsgm.train.paper.driven import (
     RATE,
     Driver,
     FollowingSgms,
-    as_maps,
     cut_pass,
     driven_step,
     last_layers,
 )
-from qsgm.train.paper.objects import PAPER_LOSS, ObjectCrops
-from qsgm.train.pretraining.maml import MOMENTUM
+from qsgm.train.paper.objects import PAPER_TASK, ObjectCrops
 from qsgm.train.pretraining.tasks import features_of
-from qsgm.tune.loop import BATCH
 
 ADAM_RATE = 1e-3  # paper section 4.1
 Sgms = Mapping[int, Sgm]
@@ -53,12 +53,12 @@ class PretrainingSizes:
 class Pretrained:
     """What fine-tuning starts from."""
 
-    network: GraspNet  # after stage 1
-    driven: GraspNet  # after stage 2, with these SGMs behind its layers 4 and 5
+    network: ConvNet  # after stage 1
+    driven: ConvNet  # after stage 2, with these SGMs behind its layers 4 and 5
     sgms: Sgms
     l1_sgms: Sgms
     label_free_sgms: Sgms
-    four_layers: GraspNet  # after stage 3, with these behind layers 3 to 5
+    four_layers: ConvNet  # after stage 3, with these behind layers 3 to 5
     four_layer_sgms: Sgms
 
 
@@ -74,13 +74,13 @@ def pretrain_without(
     torch.manual_seed(seed)
     network = pretrain_network(others, sizes.network_steps, after_step)
     driven = deepcopy(network)
-    sgms = {layer: Sgm(layer) for layer in (4, 5)}
-    l1_sgms = {layer: Sgm(layer) for layer in (4, 5)}
-    label_free: dict[int, Sgm] = {layer: LabelFreeSgm(layer) for layer in (4, 5)}
+    sgms = {layer: Sgm(GRASPNET, layer) for layer in (4, 5)}
+    l1_sgms = {layer: Sgm(GRASPNET, layer) for layer in (4, 5)}
+    label_free: dict[int, Sgm] = {layer: LabelFreeSgm(GRASPNET, layer) for layer in (4, 5)}
     watching = [FollowingSgms(l1_sgms, F.l1_loss), FollowingSgms(label_free)]
     count = sizes.crops_per_object
     drive(driven, 3, FollowingSgms(sgms), watching, others, sizes.sgm_steps, count, after_step)
-    four, four_sgms = deepcopy(driven), {3: Sgm(3), **deepcopy(sgms)}
+    four, four_sgms = deepcopy(driven), {3: Sgm(GRASPNET, 3), **deepcopy(sgms)}
     steps = sizes.four_layer_steps
     drive(four, 4, FollowingSgms(four_sgms), [], others, steps, count, after_step)
     return Pretrained(network, driven, sgms, l1_sgms, label_free, four, four_sgms)
@@ -88,15 +88,16 @@ def pretrain_without(
 
 def pretrain_network(
     objects: Sequence[ObjectCrops], steps: int, after_step: Callable[[], None]
-) -> GraspNet:
+) -> ConvNet:
     """Stage 1; torch's global generator draws weights and batches."""
     crops = torch.cat([each.crops[: each.support] for each in objects])
     labels = torch.cat([each.labels[: each.support] for each in objects])
-    net = GraspNet().train()
+    net = ConvNet(GRASPNET).train()
     optimizer = torch.optim.Adam(net.parameters(), ADAM_RATE)
     for _ in range(steps):
         rows = torch.randint(len(labels), (BATCH,))
-        loss = PAPER_LOSS(net(normalize(crops[rows]))[:, :, 0, 0], labels[rows])
+        raw = net(as_seen(GRASPNET, crops[rows]))[:, :, 0, 0]
+        loss = mean_loss(PAPER_TASK.heads, raw, labels[rows])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -105,7 +106,7 @@ def pretrain_network(
 
 
 def drive(
-    net: GraspNet,
+    net: ConvNet,
     tuned: int,
     driver: Driver,
     watching: Sequence[Driver],
@@ -126,7 +127,7 @@ def drive(
         crops_per_object: in a step.
         after_step: told of each.
     """
-    maps = [_maps(net, each, LAYERS - tuned) for each in objects]
+    maps = [_maps(net, each, net.network.depth - tuned) for each in objects]
     layers = last_layers(net, tuned)
     parameters = [p for layer in layers.values() for p in layer.parameters()]
     optimizer = torch.optim.SGD(parameters, RATE, momentum=MOMENTUM)
@@ -134,7 +135,7 @@ def drive(
         rows = [torch.randint(len(x), (crops_per_object,)) for x in maps]
         x = torch.cat([x[row] for x, row in zip(maps, rows, strict=True)])
         labels = torch.cat([o.labels[row] for o, row in zip(objects, rows, strict=True)])
-        seen = cut_pass(layers, x, labels, PAPER_LOSS)
+        seen = cut_pass(layers, x, labels, PAPER_TASK.heads)
         for other in watching:
             other.gradients(seen)
         driven_step(layers, seen, driver, optimizer)
@@ -142,7 +143,8 @@ def drive(
     net.eval()
 
 
-def _maps(net: GraspNet, crops: ObjectCrops, last_frozen: int) -> Tensor:
+def _maps(net: ConvNet, crops: ObjectCrops, last_frozen: int) -> Tensor:
     """What the frozen layers make of the learning crops: (N, C, H, W)."""
     pixels = crops.crops[: crops.support].numpy()
-    return as_maps(features_of(net, pixels, last_frozen)).contiguous()
+    features = features_of(net, pixels, last_frozen)
+    return maps_of(features, net.network.before(last_frozen + 1)).contiguous()

@@ -16,7 +16,7 @@ from qsgm.train.paper.experiment import PaperConfig, PaperResults
 from qsgm.train.paper.notes import NOTES
 from qsgm.train.paper.objects import OBJECTS, contact_sheet
 from qsgm.train.paper.published import TABLE_1, TABLE_2, Published, PublishedSystem
-from qsgm.train.paper.systems import ADAM, BATCHNORM, sgd_variant
+from qsgm.train.paper.systems import ADAM, BATCHNORM, WITH_BATCHNORM, sgd_variant
 
 METRICS = {"detection": 1, "angle": 2}  # and where it stands in a score
 _FORMS = {"detection": "{:.2f}", "angle": "{:.1f}"}
@@ -88,9 +88,10 @@ def render(results: PaperResults) -> RenderableType:
 
 _LEGEND = (
     "SGD 0.1: the paper's rate, constant; below it, or `best`: the rate of those tried with the "
-    "lowest mean objective on the same crops; both on folded weights, as on the device. BN: "
-    "batchnorm kept and on batch statistics while tuning, as in the paper. –: diverged on this "
-    "object, or on any; – 2/6: on all but 2 of 6."
+    "lowest mean objective on the same crops; both with momentum 0.9 and on folded weights, as on "
+    "the device. BN: batchnorm kept and on batch statistics while tuning, at the paper's rate; "
+    "without momentum, as we read the paper, or with 0.9. –: diverged on this object, or on any; "
+    "– 2/6: on all but 2 of 6."
 )
 
 
@@ -120,7 +121,7 @@ def _rows(results: PaperResults, system: str, metric: str) -> list[list[str]]:
     first, best = sgd_variant(results.config.rates[0]), best_variant(results, system)
     labels = {ADAM: ADAM, first: first} | ({best: best} if best else {})
     rows = []
-    for variant, label in (labels | {BATCHNORM: BATCHNORM}).items():
+    for variant, label in (labels | {name: name for name in WITH_BATCHNORM}).items():
         values = values_of(results, system, variant, metric)
         if values is not None:
             cells = _cells([*values, *_statistics(values)], _FORMS[metric].format)

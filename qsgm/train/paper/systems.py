@@ -5,11 +5,12 @@ from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS, GraspNet
+from qsgm.grasp.network import GRASPNET
+from qsgm.schedule import MOMENTUM
+from qsgm.train.model.fold import folded_start
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.paper.baselines.backpropagation import Backpropagation
 from qsgm.train.paper.baselines.direct_feedback import DirectFeedbackAlignment
 from qsgm.train.paper.baselines.feedback_alignment import FeedbackAlignment, random_feedback
@@ -20,12 +21,16 @@ from qsgm.train.paper.baselines.static_sgms import StaticSgms
 from qsgm.train.paper.baselines.target_projection import TargetProjection
 from qsgm.train.paper.baselines.tuning import Recipe, adam, constant_rate, run_baseline, sgd
 from qsgm.train.paper.driven import Driver, FixedSgms, FollowingSgms, tune_with_batchnorm
-from qsgm.train.paper.objects import PAPER_LOSS, ObjectCrops
+from qsgm.train.paper.objects import PAPER_TASK, ObjectCrops
 from qsgm.train.paper.pretraining import ADAM_RATE, Pretrained, Sgms
+from qsgm.train.pretraining.evaluate import Score
 from qsgm.train.pretraining.tasks import TaskSet, features_of
 
 ADAM = "Adam 0.001"
 BATCHNORM = "BN, SGD 0.1"
+BATCHNORM_MOMENTUM = "BN, momentum"
+# Variants of layers that keep their batchnorm, and their momentum; the paper's first.
+WITH_BATCHNORM: Mapping[str, float] = {BATCHNORM: 0.0, BATCHNORM_MOMENTUM: MOMENTUM}
 # Of SGD with momentum, constant; the paper's first.
 RATES = (1e-1, 1e-2, 3e-3, 1e-3)
 
@@ -34,7 +39,7 @@ RATES = (1e-1, 1e-2, 3e-3, 1e-3)
 class System:
     """A way to fine-tune: a start, and where gradients come from."""
 
-    net: GraspNet
+    net: ConvNet
     tuned: int
     baseline: Callable[[], Baseline]  # a new one for every run
     # The same system for layers that keep their batchnorm; None: not run so.
@@ -51,10 +56,10 @@ def all_systems(pretrained: Pretrained, seed: int) -> dict[str, System]:
     """Every system by name, in the tables' order; see :mod:`qsgm.train.paper.report`."""
     network, driven = pretrained.network, pretrained.driven
     torch.manual_seed(seed)
-    random = {layer: Sgm(layer) for layer in (4, 5)}
+    random = {layer: Sgm(GRASPNET, layer) for layer in (4, 5)}
     feedback, projections = (
-        random_feedback(folded_start(network, 3), seed),
-        random_projections(seed),
+        random_feedback(GRASPNET, folded_start(network, 3), seed),
+        random_projections(GRASPNET, seed),
     )
     return {
         **{_layers("BP", n): System(network, n, Backpropagation, with_adam=True) for n in (1, 2)},
@@ -78,28 +83,30 @@ def all_systems(pretrained: Pretrained, seed: int) -> dict[str, System]:
 
 def tune_object(
     system: System, crops: ObjectCrops, epochs: int, rates: Sequence[float], seed: int
-) -> dict[str, Tensor]:
+) -> dict[str, Score]:
     """Fine-tune on one object in every way that the system is run.
 
     Returns:
-        By variant: objective, detection accuracy and angle error [deg] on the query crops, (3,).
+        By variant, the score on the query crops.
     """
     tasks = task_of(system.net, crops, system.tuned)
     start = folded_start(system.net, system.tuned)
     scores = {
-        name: run_baseline(tasks, start, system.baseline(), recipe, PAPER_LOSS, seed)[0]
+        name: run_baseline(tasks, start, system.baseline(), recipe, PAPER_TASK, seed)[0]
         for name, recipe in _recipes(system, epochs, rates).items()
     }
-    if system.driver is not None:
-        scores[BATCHNORM] = tune_with_batchnorm(
-            system.net, system.tuned, system.driver(), tasks, epochs, PAPER_LOSS, seed
-        )[0]
+    if system.driver is None:
+        return scores
+    for name, momentum in WITH_BATCHNORM.items():
+        scores[name] = tune_with_batchnorm(
+            system.net, system.tuned, system.driver(), tasks, epochs, PAPER_TASK, seed, momentum
+        )
     return scores
 
 
-def task_of(net: GraspNet, crops: ObjectCrops, tuned: int) -> TaskSet:
+def task_of(net: ConvNet, crops: ObjectCrops, tuned: int) -> TaskSet:
     """One object's crops as the last `tuned` layers of the untouched network see them."""
-    features = features_of(net, crops.crops.numpy(), LAYERS - tuned)
+    features = features_of(net, crops.crops.numpy(), net.network.depth - tuned)
     return TaskSet(features[None].half(), crops.labels[None], crops.support)
 
 
@@ -113,11 +120,11 @@ def _recipes(system: System, epochs: int, rates: Sequence[float]) -> Mapping[str
     }
 
 
-def _static(net: GraspNet, tuned: int, sgms: Sgms) -> System:
+def _static(net: ConvNet, tuned: int, sgms: Sgms) -> System:
     return System(net, tuned, lambda: StaticSgms(sgms), lambda: FixedSgms(sgms))
 
 
-def _updating(net: GraspNet, tuned: int, sgms: Sgms) -> System:
+def _updating(net: ConvNet, tuned: int, sgms: Sgms) -> System:
     return System(
         net, tuned, lambda: OnlineSgms(sgms, 1), lambda: FollowingSgms(deepcopy(dict(sgms)))
     )

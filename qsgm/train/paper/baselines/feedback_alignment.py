@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS
+from qsgm.network import Network
 from qsgm.train.paper.baselines.interface import ForwardPass, carry_back_all
 
 
@@ -24,7 +24,9 @@ class FeedbackAlignment:
         return carry_back_all(self.feedback, batch)
 
 
-def random_feedback(start: Sequence[tuple[Tensor, Tensor]], seed: int) -> dict[int, Tensor]:
+def random_feedback(
+    network: Network, start: Sequence[tuple[Tensor, Tensor]], seed: int
+) -> dict[int, Tensor]:
     """Normal matrices with the spread of each layer's starting weight (K, C).
 
     At another spread, a layer's learning rate would not mean what it means in backpropagation.
@@ -32,5 +34,5 @@ def random_feedback(start: Sequence[tuple[Tensor, Tensor]], seed: int) -> dict[i
     generator = torch.Generator().manual_seed(seed)
     return {
         layer: weight.std() * torch.randn(weight.shape, generator=generator)
-        for layer, (weight, _) in enumerate(start, LAYERS + 1 - len(start))
+        for layer, (weight, _) in zip(network.last(len(start)), start, strict=True)
     }

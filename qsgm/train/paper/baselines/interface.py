@@ -14,12 +14,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS, Loss
+from qsgm.network import Network
+from qsgm.task import Heads
+from qsgm.train.heads import error
 from qsgm.train.model.local import (
     LayerState,
     columns,
     layer_forward,
-    loss_gradient,
     sum_windows,
     through_activation,
 )
@@ -29,15 +30,16 @@ from qsgm.train.model.local import (
 class ForwardPass:
     """A batch on its way through the tuned layers; mappings are by layer number, in order."""
 
+    network: Network
     columns: Mapping[int, Tensor]  # (T, B, P, K), what each layer sees of its input
     before: Mapping[int, Tensor]  # (T, B, P, C), pre-activations
-    activations: Mapping[int, Tensor]  # (T, B, P, C), pooled to P = 1 after layer 4
-    labels: Tensor  # (T, B, 3)
-    output_error: Tensor  # (T, B, 1, 3), gradient of each sample's loss on its raw outputs
+    activations: Mapping[int, Tensor]  # (T, B, P, C), behind the pool
+    labels: Tensor  # (T, B, L)
+    output_error: Tensor  # (T, B, 1, L), gradient of each sample's loss on its raw outputs
 
     def hidden(self) -> Mapping[int, Tensor]:
         """The activations of all tuned layers but the last."""
-        return {layer: x for layer, x in self.activations.items() if layer < LAYERS}
+        return {layer: x for layer, x in self.activations.items() if layer < self.network.depth}
 
 
 class Baseline(Protocol):
@@ -62,19 +64,23 @@ class Baseline(Protocol):
 
 @torch.no_grad()
 def forward_pass(
-    states: Mapping[int, LayerState], features: Tensor, labels: Tensor, loss: Loss
+    network: Network,
+    states: Mapping[int, LayerState],
+    features: Tensor,
+    labels: Tensor,
+    heads: Heads,
 ) -> ForwardPass:
-    """Run features (T, B, P, C) through the tuned layers and compare with labels (T, B, 3)."""
+    """Run features (T, B, P, C) through the tuned layers and compare with labels (T, B, L)."""
     seen: dict[int, Tensor] = {}
     before: dict[int, Tensor] = {}
     activations: dict[int, Tensor] = {}
     x = features
     for layer, state in states.items():
-        seen[layer] = columns(layer, x)
-        before[layer], x = layer_forward(layer, state, seen[layer])
+        seen[layer] = columns(network, layer, x)
+        before[layer], x = layer_forward(network, layer, state, seen[layer])
         activations[layer] = x
-    error = loss_gradient(loss, x, labels[:, :, None])
-    return ForwardPass(seen, before, activations, labels, error)
+    wrong = error(heads, x, labels[:, :, None])
+    return ForwardPass(network, seen, before, activations, labels, wrong)
 
 
 def carry_back(layer: int, weight: Tensor, batch: ForwardPass, gradient: Tensor) -> Tensor:
@@ -86,9 +92,9 @@ def carry_back(layer: int, weight: Tensor, batch: ForwardPass, gradient: Tensor)
         batch: has to hold the activation of the layer before.
         gradient: on its activation.
     """
-    dz = through_activation(layer, batch.before[layer], gradient)
+    dz = through_activation(batch.network, layer, batch.before[layer], gradient)
     windows = dz @ weight.transpose(-1, -2).unsqueeze(-3)
-    return sum_windows(layer, windows, batch.activations[layer - 1].shape[2])
+    return sum_windows(batch.network, layer, windows)
 
 
 def carry_back_all(weights: Mapping[int, Tensor], batch: ForwardPass) -> dict[int, Tensor]:

@@ -15,10 +15,10 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS
+from qsgm.schedule import MOMENTUM
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.paper.baselines.interface import ForwardPass, carry_back, carry_back_all
-from qsgm.train.pretraining.maml import MOMENTUM, apply_sgm
+from qsgm.train.pretraining.maml import apply_sgm
 
 # (weights, batch, synthetic gradients by layer) -> what they should have been
 Target = Callable[[Mapping[int, Tensor], ForwardPass, Mapping[int, Tensor]], Mapping[int, Tensor]]
@@ -37,7 +37,7 @@ def bootstrapped_target(
     weights: Mapping[int, Tensor], batch: ForwardPass, synthetic: Mapping[int, Tensor]
 ) -> Mapping[int, Tensor]:
     """Each layer's from the gradient that the next layer itself was given."""
-    given = {**synthetic, LAYERS: batch.output_error}
+    given = {**synthetic, batch.network.depth: batch.output_error}
     return {
         layer: carry_back(layer + 1, weights[layer + 1], batch, given[layer + 1])
         for layer in synthetic

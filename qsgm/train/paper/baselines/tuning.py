@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qsgm.train.model.graspnet import LAYERS, Loss
+from qsgm.network import Network
+from qsgm.schedule import MOMENTUM, rate_factor
+from qsgm.task import Task
 from qsgm.train.model.local import LayerState, through_activation, weight_gradients
 from qsgm.train.paper.baselines.interface import Baseline, ForwardPass, forward_pass
-from qsgm.train.pretraining.evaluate import score
-from qsgm.train.pretraining.maml import MOMENTUM
+from qsgm.train.pretraining.evaluate import Score, score
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches
-from qsgm.tune.loop import rate_factor
 
 # A parameter group per layer, as torch.optim has them -> what updates them
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
@@ -51,9 +51,9 @@ def run_baseline(
     start: Sequence[tuple[Tensor, Tensor]],
     baseline: Baseline,
     recipe: Recipe,
-    loss: Loss,
+    task: Task,
     seed: int,
-) -> Tensor:
+) -> list[Score]:
     """Fine-tune all tasks, side by side and independent of each other, and score them.
 
     Args:
@@ -61,15 +61,13 @@ def run_baseline(
         start: weight (K, C) and bias (C,) of the tuned layers, in order, the same for all tasks.
         baseline: one that learns has to be new.
         recipe: optimizer, rates, epochs.
-        loss: and with it the angle encoding.
+        task: gives loss and scores.
         seed: of the order of crops.
 
     Returns:
-        (T, 3): objective, detection accuracy and angle error [deg] on the query crops, as
-        :func:`qsgm.train.pretraining.evaluate.score` has them; a run that diverged shows in its
-        objective.
+        Every task's score on its query crops; a run that diverged shows in its objective.
     """
-    return score(tuned_states(tasks, start, baseline, recipe, loss, seed), tasks, loss)
+    return score(tuned_states(tasks, start, baseline, recipe, task, seed), tasks, task)
 
 
 @torch.no_grad()
@@ -78,18 +76,19 @@ def tuned_states(
     start: Sequence[tuple[Tensor, Tensor]],
     baseline: Baseline,
     recipe: Recipe,
-    loss: Loss,
+    task: Task,
     seed: int,
 ) -> list[LayerState]:
     """What :func:`run_baseline` scores: the tuned layers, their momenta left out."""
-    states = _states(start, len(tasks))
+    network = task.network
+    states = _states(network, start, len(tasks))
     optimizer = recipe.optimizer(_groups(states, recipe.rates))
     batches = list(shuffled_batches(tasks.support, recipe.epochs, seed))
     for step, rows in enumerate(batches):
         features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
-        batch = forward_pass(states, features, labels, loss)
+        batch = forward_pass(network, states, features, labels, task.heads)
         weights = {layer: state.weight for layer, state in states.items()}
-        given = {**baseline.gradients(weights, batch), LAYERS: batch.output_error}
+        given = {**baseline.gradients(weights, batch), network.depth: batch.output_error}
         _set_gradients(states, batch, given)
         for group, rate in zip(optimizer.param_groups, recipe.rates, strict=True):
             group["lr"] = rate * recipe.factor(step, len(batches))
@@ -97,11 +96,13 @@ def tuned_states(
     return list(states.values())
 
 
-def _states(start: Sequence[tuple[Tensor, Tensor]], tasks: int) -> dict[int, LayerState]:
+def _states(
+    network: Network, start: Sequence[tuple[Tensor, Tensor]], tasks: int
+) -> dict[int, LayerState]:
     """A start of its own for every task, by layer; the optimizer updates it in place."""
     return {
         layer: LayerState.start(weight.repeat(tasks, 1, 1), bias.repeat(tasks, 1))
-        for layer, (weight, bias) in enumerate(start, LAYERS + 1 - len(start))
+        for layer, (weight, bias) in zip(network.last(len(start)), start, strict=True)
     }
 
 
@@ -117,5 +118,5 @@ def _set_gradients(
 ) -> None:
     """Every layer's own gradients, from the one it was given on its activation."""
     for layer, state in states.items():
-        dz = through_activation(layer, batch.before[layer], given[layer])
+        dz = through_activation(batch.network, layer, batch.before[layer], given[layer])
         state.weight.grad, state.bias.grad = weight_gradients(batch.columns[layer], dz)
