@@ -8,10 +8,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.train.model.graspnet import GraspNet, Loss
-from qsgm.train.model.local import LayerState, local_step, loss_gradient, true_gradients
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import GraspTask
+from qsgm.schedule import rate_factor
+from qsgm.train.heads import error, mean_loss
+from qsgm.train.model.fold import folded_start
+from qsgm.train.model.local import LayerState, local_step, true_gradients
+from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.model.start import folded_start
 from qsgm.train.paper.baselines.backpropagation import Backpropagation
 from qsgm.train.paper.baselines.direct_feedback import DirectFeedbackAlignment
 from qsgm.train.paper.baselines.feedback_alignment import FeedbackAlignment, random_feedback
@@ -29,16 +33,15 @@ from qsgm.train.paper.baselines.tuning import (
     sgd,
     tuned_states,
 )
-from qsgm.train.pretraining.evaluate import score
+from qsgm.train.pretraining.evaluate import Score, score
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
-from qsgm.tune.loop import rate_factor
-from tests.nets import random_net
+from nets import random_net
 
 TASKS, CROPS, SUPPORT = 2, 50, 40
 SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees of a crop
 CHANNELS = {1: 3, 2: 8, 3: 8, 4: 16, 5: 16, 6: 16}
-LOSS = Loss("paper", label_smoothing=0.0)
+TASK = GraspTask("paper", label_smoothing=0.0)
 Start = list[tuple[Tensor, Tensor]]
 
 
@@ -53,6 +56,12 @@ def random_tasks(tuned: int, tasks: int = TASKS) -> TaskSet:
     return TaskSet(features, labels, SUPPORT)
 
 
+def figures(scores: list[Score]) -> Tensor:
+    """Objective, detection accuracy and angle error [deg] of every task, (T, 3)."""
+    names = ("detection_accuracy", "angle_mae_deg")
+    return torch.tensor([[one.objective, *(one.scores[n] for n in names)] for one in scores])
+
+
 def random_start(tuned: int) -> Start:
     return folded_start(random_net(tuned), tuned)
 
@@ -60,7 +69,7 @@ def random_start(tuned: int) -> Start:
 def random_sgms() -> dict[int, Sgm]:
     """Outputs of about the size of true gradients."""
     torch.manual_seed(1)
-    sgms = {layer: Sgm(layer) for layer in (3, 4, 5)}
+    sgms = {layer: Sgm(GRASPNET, layer) for layer in (3, 4, 5)}
     for sgm in sgms.values():
         torch.nn.init.normal_(sgm.convs[-1].weight, std=0.01)
         torch.nn.init.normal_(sgm.norms[0].running_mean)
@@ -72,15 +81,19 @@ def one_batch(tuned: int, start: Start | None = None) -> tuple[dict[int, Tensor]
     tasks = random_tasks(tuned)
     states = dict(enumerate(start_states(start or random_start(tuned), TASKS), 7 - tuned))
     weights = {layer: state.weight for layer, state in states.items()}
-    return weights, forward_pass(states, tasks.features.float(), tasks.labels, LOSS)
+    return weights, forward_pass(GRASPNET, states, tasks.features.float(), tasks.labels, TASK.heads)
 
 
 # Made anew for a number of tasks and a start.
 BASELINES: dict[str, Callable[[int, Start], Baseline]] = {
     "backpropagation": lambda _tasks, _start: Backpropagation(),
-    "feedback alignment": lambda _tasks, start: FeedbackAlignment(random_feedback(start, 1)),
-    "direct feedback": lambda _tasks, _start: DirectFeedbackAlignment(random_projections(1)),
-    "target projection": lambda _tasks, _start: TargetProjection(random_projections(1)),
+    "feedback alignment": lambda _tasks, start: FeedbackAlignment(
+        random_feedback(GRASPNET, start, 1)
+    ),
+    "direct feedback": lambda _tasks, _start: DirectFeedbackAlignment(
+        random_projections(GRASPNET, 1)
+    ),
+    "target projection": lambda _tasks, _start: TargetProjection(random_projections(GRASPNET, 1)),
     "static SGMs": lambda _tasks, _start: StaticSgms(random_sgms()),
     "online SGMs": lambda tasks, _start: OnlineSgms(random_sgms(), tasks),
     "bootstrapped SGMs": lambda tasks, _start: OnlineSgms(
@@ -132,7 +145,7 @@ def test_backpropagation_equals_autograd_and_torch_optim(
     tasks, start = random_tasks(tuned), random_start(tuned)
     rates = tuple(rate * (1 + i) for i in range(tuned))
     recipe = Recipe(make, rates, 3, factor)
-    states = tuned_states(tasks, start, Backpropagation(), recipe, LOSS, 5)
+    states = tuned_states(tasks, start, Backpropagation(), recipe, TASK, 5)
     for task in range(TASKS):
         layers = plain_layers(start)
         optimizer = torchs([{"params": conv.parameters(), "lr": 0.0} for conv in layers])
@@ -142,7 +155,7 @@ def test_backpropagation_equals_autograd_and_torch_optim(
                 group["lr"] = own * (1 - step / len(batches) if factor is rate_factor else 1)
             *_, raw = run_plain(layers, tasks.features[task, rows].float())
             optimizer.zero_grad()
-            LOSS(raw.flatten(1), tasks.labels[task, rows]).backward()
+            mean_loss(TASK.heads, raw.flatten(1), tasks.labels[task, rows]).backward()
             optimizer.step()
         for conv, state, (weight, _) in zip(layers, states, start, strict=True):
             learnt = conv.weight.detach().permute(2, 3, 1, 0).flatten(0, 2)
@@ -157,7 +170,13 @@ def test_feedback_through_the_weights_themselves_is_backpropagation(tuned: int) 
     weights, batch = one_batch(tuned, start)
     own = {layer: weight[0] for layer, weight in weights.items()}
     tasks = random_tasks(tuned)
-    true = true_gradients(start_states(start, TASKS), tasks.features.float(), tasks.labels, LOSS)
+    true = true_gradients(
+        GRASPNET,
+        start_states(start, TASKS),
+        tasks.features.float(),
+        tasks.labels,
+        TASK.heads,
+    )
     got = FeedbackAlignment(own).gradients({}, batch)
     assert set(got) == set(range(7 - tuned, 6))
     for layer, gradient in got.items():
@@ -166,13 +185,13 @@ def test_feedback_through_the_weights_themselves_is_backpropagation(tuned: int) 
 
 def test_random_feedback_has_the_spread_of_the_weights() -> None:
     start = random_start(3)
-    feedback = random_feedback(start, 2)
+    feedback = random_feedback(GRASPNET, start, 2)
     assert list(feedback) == [4, 5, 6]
     for (weight, _), matrix in zip(start, feedback.values(), strict=True):
         assert matrix.shape == weight.shape
         assert float(matrix.std() / weight.std()) == pytest.approx(1, abs=0.25)
-    assert torch.equal(feedback[4], random_feedback(start, 2)[4])
-    assert not torch.equal(feedback[4], random_feedback(start, 3)[4])
+    assert torch.equal(feedback[4], random_feedback(GRASPNET, start, 2)[4])
+    assert not torch.equal(feedback[4], random_feedback(GRASPNET, start, 3)[4])
 
 
 def test_direct_feedback_through_the_last_layers_weight_is_backpropagation() -> None:
@@ -187,7 +206,7 @@ def test_direct_feedback_through_the_last_layers_weight_is_backpropagation() -> 
 
 def test_direct_feedback_projects_every_crops_error() -> None:
     weights, batch = one_batch(4)
-    projections = random_projections(0)
+    projections = random_projections(GRASPNET, 0)
     got = DirectFeedbackAlignment(projections).gradients(weights, batch)
     assert set(got) == {3, 4, 5}
     error = batch.output_error[1, 7, 0]
@@ -198,7 +217,7 @@ def test_direct_feedback_projects_every_crops_error() -> None:
 def test_target_projection_looks_at_nothing_but_the_label() -> None:
     start = random_start(3)
     other = [start[0], *[(weight + 1, bias - 1) for weight, bias in start[1:]]]
-    system = TargetProjection(random_projections(0))
+    system = TargetProjection(random_projections(GRASPNET, 0))
     got = system.gradients(*one_batch(3, start))
     weights, batch = one_batch(3, other)
     assert not torch.equal(batch.output_error, one_batch(3, start)[1].output_error)
@@ -207,14 +226,14 @@ def test_target_projection_looks_at_nothing_but_the_label() -> None:
         negative = batch.labels[..., 0] == 0
         assert (gradient[negative] == 0).all()
         assert (gradient[~negative] != 0).all()
-    label, projection = batch.labels[0, 3], random_projections(0)[4]
+    label, projection = batch.labels[0, 3], random_projections(GRASPNET, 0)[4]
     torch.testing.assert_close(got[4][0, 3], torch.tensordot(label, projection, dims=1))
 
 
 def test_projections_fit_the_activations_of_a_crop() -> None:
-    projections = random_projections(0)
+    projections = random_projections(GRASPNET, 0)
     x = torch.zeros(1, 3, 128, 128)
-    for layer, module in enumerate(GraspNet().eval().layers[:5], 1):
+    for layer, module in enumerate(ConvNet(GRASPNET).eval().layers[:5], 1):
         x = module(x)
         matrix = projections[layer]
         assert matrix.shape == (3, x[0, 0].numel(), x.shape[1])
@@ -228,21 +247,21 @@ def test_static_sgms_tune_as_the_local_steps_do(tuned: int) -> None:
     tasks, start, sgms = random_tasks(tuned), random_start(tuned), random_sgms()
     rates = (3e-3, 1e-3, 2e-3, 1e-3)[:tuned]
     before = {layer: deepcopy(sgm.state_dict()) for layer, sgm in sgms.items()}
-    scores = run_baseline(tasks, start, StaticSgms(sgms), Recipe(sgd, rates, 4), LOSS, 3)
+    scores = figures(run_baseline(tasks, start, StaticSgms(sgms), Recipe(sgd, rates, 4), TASK, 3))
 
     @torch.no_grad()
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
-            return loss_gradient(LOSS, activation, labels[:, :, None])
+            return error(TASK.heads, activation, labels[:, :, None])
         return apply_sgm(sgms[layer], activation, labels)
 
     states, batches = start_states(start, TASKS), list(shuffled_batches(SUPPORT, 4, 3))
     for step, rows in enumerate(batches):
         features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
         now = [torch.tensor(rate * (1 - step / len(batches))) for rate in rates]
-        states = local_step(states, features, labels, now, gradient_of, 0.9)
+        states = local_step(GRASPNET, states, features, labels, now, gradient_of, 0.9)
     assert scores.shape == (TASKS, 3)
-    torch.testing.assert_close(scores, score(states, tasks, LOSS), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(scores, figures(score(states, tasks, TASK)), atol=1e-4, rtol=1e-4)
     for layer, sgm in sgms.items():
         for name, value in sgm.state_dict().items():
             assert torch.equal(value, before[layer][name])
@@ -250,7 +269,7 @@ def test_static_sgms_tune_as_the_local_steps_do(tuned: int) -> None:
 
 def test_a_label_free_sgm_answers_every_label_alike() -> None:
     torch.manual_seed(0)
-    sgm, plain = LabelFreeSgm(4), Sgm(4)
+    sgm, plain = LabelFreeSgm(GRASPNET, 4), Sgm(GRASPNET, 4)
     plain.load_state_dict(sgm.state_dict())
     activation, labels = torch.rand(9, 16, 1, 1), torch.rand(9, 3)
     with torch.no_grad():
@@ -308,25 +327,29 @@ def test_bootstrapped_targets_are_the_next_layers_synthetic_gradient_carried_bac
 def test_tasks_tuned_side_by_side_do_not_see_each_other(name: str) -> None:
     tasks, start = random_tasks(3), random_start(3)
     recipe = Recipe(sgd, (1e-3, 1e-3, 1e-3), 2)
-    together = run_baseline(tasks, start, BASELINES[name](TASKS, start), recipe, LOSS, 0)
-    untouched = run_baseline(tasks, start, Backpropagation(), Recipe(sgd, (0.0,) * 3, 1), LOSS, 0)
+    together = figures(run_baseline(tasks, start, BASELINES[name](TASKS, start), recipe, TASK, 0))
+    untouched = figures(
+        run_baseline(tasks, start, Backpropagation(), Recipe(sgd, (0.0,) * 3, 1), TASK, 0)
+    )
     assert (together[:, 0] != untouched[:, 0]).all()
     for task, alone in enumerate(tasks.chunks(1)):
-        scores = run_baseline(alone, start, BASELINES[name](1, start), recipe, LOSS, 0)
+        scores = figures(run_baseline(alone, start, BASELINES[name](1, start), recipe, TASK, 0))
         torch.testing.assert_close(together[task], scores[0], atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_the_last_layer_alone_learns_from_the_loss_in_every_system(name: str) -> None:
     tasks, start, recipe = random_tasks(1), random_start(1), Recipe(adam, (1e-2,), 2)
-    got = run_baseline(tasks, start, BASELINES[name](TASKS, start), recipe, LOSS, 0)
-    expected = run_baseline(tasks, start, Backpropagation(), recipe, LOSS, 0)
+    got = figures(run_baseline(tasks, start, BASELINES[name](TASKS, start), recipe, TASK, 0))
+    expected = figures(run_baseline(tasks, start, Backpropagation(), recipe, TASK, 0))
     torch.testing.assert_close(got, expected)
 
 
 def test_a_run_that_diverges_says_so_in_its_loss() -> None:
     tasks, start = random_tasks(3), random_start(3)
-    scores = run_baseline(tasks, start, Backpropagation(), Recipe(sgd, (1e6,) * 3, 3), LOSS, 0)
+    scores = figures(
+        run_baseline(tasks, start, Backpropagation(), Recipe(sgd, (1e6,) * 3, 3), TASK, 0)
+    )
     assert not (scores[:, 0] < 1e3).any()
 
 
@@ -334,7 +357,7 @@ def test_the_callers_start_is_not_changed() -> None:
     start = random_start(2)
     before = [weight.clone() for weight, _ in start]
     recipe = Recipe(sgd, (0.1, 0.1), 1)
-    states = tuned_states(random_tasks(2), start, Backpropagation(), recipe, LOSS, 0)
+    states = tuned_states(random_tasks(2), start, Backpropagation(), recipe, TASK, 0)
     assert isinstance(states[0], LayerState)
     for (weight, _), old in zip(start, before, strict=True):
         assert torch.equal(weight, old)

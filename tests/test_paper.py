@@ -14,7 +14,9 @@ from torch import nn
 
 from qsgm import cli
 from qsgm.grasp.crops import plan_crops
-from qsgm.train.model.graspnet import GraspNet, normalize
+from qsgm.grasp.network import GRASPNET
+from qsgm.train.heads import mean_loss, per_sample
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.model.sgm import Sgm, SgmLayer
 from qsgm.train.paper import experiment, objects, report, systems
 from qsgm.train.paper.driven import (
@@ -26,11 +28,11 @@ from qsgm.train.paper.driven import (
     tune_with_batchnorm,
 )
 from qsgm.train.paper.experiment import QUICK, PaperConfig, PaperResults
-from qsgm.train.paper.objects import OBJECTS, PAPER_LOSS, ObjectCrops, contact_sheet, cut_object
+from qsgm.train.paper.objects import OBJECTS, PAPER_TASK, ObjectCrops, contact_sheet, cut_object
 from qsgm.train.paper.pretraining import Pretrained, PretrainingSizes, pretrain_without
 from qsgm.train.paper.published import SEVENTH_OBJECT, TABLE_1, TABLE_2
-from qsgm.train.paper.systems import ADAM, BATCHNORM, task_of
-from tests.nets import random_net
+from qsgm.train.paper.systems import ADAM, WITH_BATCHNORM, task_of
+from nets import random_net
 
 SIZES = PretrainingSizes(2, 2, 1, 4)
 
@@ -41,7 +43,7 @@ def crops() -> dict[str, ObjectCrops]:
     return {letter: cut_object(OBJECTS[letter].draw(), 40, 0) for letter in ("a", "b", "c")}
 
 
-def random_batch(net: GraspNet, tuned: int) -> tuple[torch.Tensor, torch.Tensor]:
+def random_batch(net: ConvNet, tuned: int) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(7)
     with torch.no_grad():
         x = net.between(torch.randn(10, 3, 128, 128), 1, 6 - tuned)
@@ -111,9 +113,9 @@ def test_true_gradients_of_cut_layers_equal_autograd_through_all_of_them(tuned: 
     reference, outputs = x, {}
     for number, layer in deepcopy(layers).items():
         reference = outputs[number] = layer(reference)
-    total = PAPER_LOSS.per_sample(reference[:, :, 0, 0], labels).sum()
+    total = per_sample(PAPER_TASK.heads, reference[:, :, 0, 0], labels).sum()
     expected = dict(zip(outputs, torch.autograd.grad(total, list(outputs.values())), strict=True))
-    seen = cut_pass(layers, x, labels, PAPER_LOSS)
+    seen = cut_pass(layers, x, labels, PAPER_TASK.heads)
     assert set(seen.true) == set(expected) == set(layers)
     for number, gradient in expected.items():
         torch.testing.assert_close(seen.true[number], gradient, atol=1e-6, rtol=1e-4)
@@ -121,7 +123,7 @@ def test_true_gradients_of_cut_layers_equal_autograd_through_all_of_them(tuned: 
 
 def test_a_driven_step_equals_the_papers_hook_in_a_network() -> None:
     """`SgmLayer` puts the synthetic gradient in place during torch's own backward pass."""
-    net, sgms = random_net(1), {layer: Sgm(layer).eval() for layer in (4, 5)}
+    net, sgms = random_net(1), {layer: Sgm(GRASPNET, layer).eval() for layer in (4, 5)}
     x, labels = random_batch(net, 3)
     reference = deepcopy(net).train()
     optimizer = torch.optim.SGD(reference.parameters(), 0.1, momentum=0.9)
@@ -129,12 +131,12 @@ def test_a_driven_step_equals_the_papers_hook_in_a_network() -> None:
     for number in (4, 5, 6):
         after = reference.layers[number - 1](after)
         after = SgmLayer(sgms[number])(after, labels) if number < 6 else after
-    PAPER_LOSS(after[:, :, 0, 0], labels).backward()
+    mean_loss(PAPER_TASK.heads, after[:, :, 0, 0], labels).backward()
     optimizer.step()
     layers = last_layers(net, 3)
     parameters = [p for layer in layers.values() for p in layer.parameters()]
     own = torch.optim.SGD(parameters, 0.1, momentum=0.9)
-    driven_step(layers, cut_pass(layers, x, labels, PAPER_LOSS), FixedSgms(sgms), own)
+    driven_step(layers, cut_pass(layers, x, labels, PAPER_TASK.heads), FixedSgms(sgms), own)
     for number, layer in layers.items():
         theirs = reference.layers[number - 1].state_dict()
         for name, value in layer.state_dict().items():
@@ -143,9 +145,9 @@ def test_a_driven_step_equals_the_papers_hook_in_a_network() -> None:
 
 @pytest.mark.parametrize("criterion", [nn.functional.mse_loss, nn.functional.l1_loss])
 def test_following_sgms_take_torchs_step_towards_the_true_gradient(criterion) -> None:
-    net, sgms = random_net(2), {4: Sgm(4), 5: Sgm(5)}
+    net, sgms = random_net(2), {4: Sgm(GRASPNET, 4), 5: Sgm(GRASPNET, 5)}
     x, labels = random_batch(net, 3)
-    seen = cut_pass(last_layers(net, 3), x, labels, PAPER_LOSS)
+    seen = cut_pass(last_layers(net, 3), x, labels, PAPER_TASK.heads)
     references = deepcopy(sgms)
     given = FollowingSgms(sgms, criterion).gradients(seen)
     for layer, reference in references.items():
@@ -162,21 +164,33 @@ def test_following_sgms_take_torchs_step_towards_the_true_gradient(criterion) ->
 def test_fixed_sgms_and_the_network_stay_as_they_are_while_a_copy_is_tuned(
     crops: dict[str, ObjectCrops],
 ) -> None:
-    net, sgms = random_net(3), {4: Sgm(4), 5: Sgm(5)}
+    net, sgms = random_net(3), {4: Sgm(GRASPNET, 4), 5: Sgm(GRASPNET, 5)}
     before = deepcopy((net.state_dict(), [sgm.state_dict() for sgm in sgms.values()]))
     tasks = task_of(net, crops["a"], 3)
-    scores = tune_with_batchnorm(net, 3, FixedSgms(sgms), tasks, 1, PAPER_LOSS, 0)
-    untouched = tune_with_batchnorm(net, 3, FixedSgms(sgms), tasks, 0, PAPER_LOSS, 0)
-    assert scores.shape == (1, 3)
+    scores = tune_with_batchnorm(net, 3, FixedSgms(sgms), tasks, 1, PAPER_TASK, 0)
+    untouched = tune_with_batchnorm(net, 3, FixedSgms(sgms), tasks, 0, PAPER_TASK, 0)
     with torch.no_grad():
-        raw = net(normalize(crops["a"].crops[32:]))[:, :, 0, 0]
+        raw = net(as_seen(GRASPNET, crops["a"].crops[32:]))[:, :, 0, 0]
     right = (raw[:, 0] > 0) == (crops["a"].labels[32:, 0] > 0)
-    assert untouched[0, 1] == right.float().mean()
-    assert scores[0, 0] != untouched[0, 0]
+    assert untouched.scores["detection_accuracy"] == pytest.approx(float(right.float().mean()))
+    assert scores.objective != untouched.objective
     for old, new in zip(before[0].values(), net.state_dict().values(), strict=True):
         assert torch.equal(old, new)
     for old, sgm in zip(before[1], sgms.values(), strict=True):
         assert all(torch.equal(v, old[name]) for name, v in sgm.state_dict().items())
+
+
+def test_fine_tuning_has_no_momentum_unless_it_is_asked_for(crops: dict[str, ObjectCrops]) -> None:
+    """The first step, one batch an epoch here, is the same with it; the second is not."""
+    net, driver = random_net(4), FixedSgms({4: Sgm(GRASPNET, 4), 5: Sgm(GRASPNET, 5)})
+    tasks = task_of(net, crops["a"], 3)
+    for epochs, same in ((1, True), (2, False)):
+        default, plain, heavy = (
+            tune_with_batchnorm(net, 3, driver, tasks, epochs, PAPER_TASK, 0, *momentum)
+            for momentum in ((), (0.0,), (0.9,))
+        )
+        assert default == plain
+        assert (default == heavy) == same
 
 
 # --- Pretraining ---------------------------------------------------------------------------------
@@ -305,7 +319,8 @@ def test_bench_paper_runs_from_the_command_line_in_a_tiny_version(
         else:
             assert {"SGD 0.1", "SGD 0.01"} <= set(system["variants"])
         driven = name.startswith("SGM") or name.endswith("updating")
-        assert (BATCHNORM in system["variants"]) == driven
+        for variant in WITH_BATCHNORM:
+            assert (variant in system["variants"]) == driven
         for variant in system["variants"].values():
             assert list(variant["detection"]["values"]) == ["a", "b"]
 
@@ -318,4 +333,4 @@ def test_every_system_has_the_number_of_layers_its_name_says(
         said = [int(word) for word in name.split() if word.isdigit()]
         updating = name.endswith("updating")
         assert system.tuned == (said[0] if said else 2 if updating else 3)
-    assert objects.PAPER_LOSS.encoding == "paper"
+    assert objects.PAPER_TASK.encoding == "paper"

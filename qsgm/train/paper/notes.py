@@ -6,6 +6,8 @@ NOTES: tuple[str, ...] = (
     "The paper does not say how long it trains: here 1000 steps for the network, 3000 for the SGMs "
     "and 30 epochs of fine-tuning. Nor does it say whether the pool takes the maximum or, as here, "
     "the mean.",
+    "The paper names a momentum of 0.9 for pretraining; of fine-tuning it says the rate alone. "
+    "Static SGMs on batchnorm converge without momentum, and with it blow up in the end.",
     "A step at 0.1 is one through batchnorm in the paper. On folded weights, which is what a "
     "device has, the same rate is another step, and mostly one too far.",
     "The paper's encoding of the angle jumps at 90 degrees, for every method alike. An angle's "
