@@ -5,6 +5,7 @@ from copy import deepcopy
 
 import pytest
 import torch
+from nets import random_net
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -36,7 +37,6 @@ from qsgm.train.paper.baselines.tuning import (
 from qsgm.train.pretraining.evaluate import Score, score
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
-from nets import random_net
 
 TASKS, CROPS, SUPPORT = 2, 50, 40
 SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees of a crop

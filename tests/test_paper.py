@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from nets import random_net
 from rich.console import Console
 from torch import nn
 
@@ -32,7 +33,6 @@ from qsgm.train.paper.objects import OBJECTS, PAPER_TASK, ObjectCrops, contact_s
 from qsgm.train.paper.pretraining import Pretrained, PretrainingSizes, pretrain_without
 from qsgm.train.paper.published import SEVENTH_OBJECT, TABLE_1, TABLE_2
 from qsgm.train.paper.systems import ADAM, WITH_BATCHNORM, task_of
-from nets import random_net
 
 SIZES = PretrainingSizes(2, 2, 1, 4)
 
