@@ -44,7 +44,7 @@ from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.memory import graph_memory
-from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
+from qsgm.train.graphs.optimizers import OPTIMIZERS, Optimizer
 from qsgm.train.graphs.probe import head_model, probe_model
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
 from qsgm.train.graphs.step import AnySgm, step_model
@@ -55,7 +55,7 @@ from qsgm.train.graphs.trunk import (
     trunk_model,
 )
 from qsgm.train.heads import activate
-from qsgm.train.model.arrays import FLAT_ARRAYS, FoldedNet
+from qsgm.train.model.arrays import FLAT_ARRAYS, CurvatureArrays, FoldedNet
 from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.model.net import as_seen
 from qsgm.train.quantization.calibrate import AUTO, calibrate
@@ -68,13 +68,9 @@ from qsgm.train.quantization.trunk_ranges import observe_trunk
 SEED = 0
 # Of the frozen layers, unless the user says otherwise: in int8 they take longer (docs/cost.md).
 TRUNK: Precision = "float"
-OPTIMIZERS: dict[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
 # Folding moves rounding errors about, no more: larger than this, it went wrong.
 LARGEST_FOLD_ERROR = 1e-4  # relative to the largest output
 FOLD_SAMPLES = 64
-# SGD's rates for the SGMs are meta-trained; these are the usual ones, for every layer.
-BACKPROP_RATES: dict[OptimizerName, float] = {"sgd": 1e-2, "adam": 1e-3}
-SGM_ADAM_RATE = 2e-3
 # As many as were meta-trained together, and for which the gain of short runs was found.
 MAML_LAYERS = 3
 
@@ -280,11 +276,15 @@ def build_steps(
     net, heads = trainee.net, trainee.checkpoint.task.heads
     variants: dict[Precision, Mapping[int, AnySgm]] = {"int8": int8_sgms, "float": trainee.sgms}
     # Meta-trained with SGD and SGMs: neither Adam nor backpropagation uses it.
-    learnt = {k: one.arrays() for k, one in trainee.checkpoint.curvatures.items()}
-    curvatures = {"sgd": learnt if blocks.sgm_layers else FLAT_ARRAYS, "adam": FLAT_ARRAYS}
+    bent = {k: one.arrays() for k, one in trainee.checkpoint.curvatures.items()}
+
+    def curvatures(optimizer: Optimizer) -> Mapping[int, CurvatureArrays]:
+        meta_trained = optimizer.sgm_rate is None and blocks.sgm_layers
+        return bent if meta_trained else FLAT_ARRAYS
+
     return {
         step_file(precision, name, blocks): step_model(
-            net, blocks, variants[precision], heads, OPTIMIZERS[name], curvatures[name]
+            net, blocks, variants[precision], heads, OPTIMIZERS[name], curvatures(OPTIMIZERS[name])
         )
         for precision in (PRECISIONS if blocks.sgm_layers else ("float",))
         for name in optimizers_of(blocks)
@@ -351,19 +351,21 @@ def places(trainee: Trainee, network: bytes) -> dict[str, Place]:
 
 def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Recipes]:
     """Default optimizer and rates of both methods, by blocks."""
-    sgm: dict[OptimizerName, dict[str, tuple[float, ...]]] = {
-        "sgd": {str(one): sgm_rates(checkpoint, one) for one in blocks},
-        "adam": {
-            str(one): (SGM_ADAM_RATE,) * len(one.layers)
+    sgm = {
+        name: {
+            str(one): sgm_rates(checkpoint, one)
+            if optimizer.sgm_rate is None
+            else (optimizer.sgm_rate,) * len(one.layers)
             for one in blocks
-            if "adam" in optimizers_of(one)
-        },
+            if name in optimizers_of(one)
+        }
+        for name, optimizer in OPTIMIZERS.items()
     }
     network = checkpoint.task.network
     whole = [one_block(network.last(tuned)) for tuned in range(1, checkpoint.most_layers + 1)]
     bp = {
-        name: {str(one): (rate,) * len(one.layers) for one in whole}
-        for name, rate in BACKPROP_RATES.items()
+        name: {str(one): (optimizer.rate,) * len(one.layers) for one in whole}
+        for name, optimizer in OPTIMIZERS.items()
     }
     gains = {
         str(one): checkpoint.short_gain if len(one.layers) >= MAML_LAYERS else 1.0 for one in blocks

@@ -4,13 +4,14 @@ An optimizer names the moments it keeps of every parameter, all of which start a
 the rule that updates one parameter. Whatever the steps share is declared once, by `rule`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from onnx import TensorProto
 
+from qsgm.manifest import OptimizerName
 from qsgm.schedule import MOMENTUM
 from qsgm.train.graphs.build import Graph, Ops, Product, Value
 
@@ -27,6 +28,16 @@ class Optimizer(Protocol):
         """What is kept of each parameter, as in `weight_<moment>4`."""
         ...
 
+    @property
+    def rate(self) -> float:
+        """The usual one, for true gradients and every layer."""
+        ...
+
+    @property
+    def sgm_rate(self) -> float | None:
+        """The usual one for SGMs' gradients; None: those that were meta-trained."""
+        ...
+
     def rule(self, graph: Graph) -> Rule:
         """Declare what all parameters share, and return the update of one of them."""
         ...
@@ -37,6 +48,8 @@ class Sgd:
     """SGD with momentum, without dampening, as torch has it."""
 
     momentum: float = MOMENTUM
+    rate: float = 1e-2
+    sgm_rate: float | None = None
 
     @property
     def moments(self) -> tuple[str, ...]:
@@ -63,6 +76,8 @@ class Adam:
     mean_decay: float = 0.9
     square_decay: float = 0.999
     epsilon: float = 1e-8
+    rate: float = 1e-3
+    sgm_rate: float | None = 2e-3
 
     @property
     def moments(self) -> tuple[str, ...]:
@@ -111,3 +126,7 @@ def _correction(op: Ops, decay: float, step: Value) -> Value:
     # In double: in float32, 1 - 0.999 is already wrong in its fourth digit.
     power = op.Pow(op.constant(decay, np.float64), op.Cast(step, to=TensorProto.DOUBLE))
     return op.Cast(op.Sub(op.constant(1.0, np.float64), power), to=TensorProto.FLOAT)
+
+
+# What bundles are exported with.
+OPTIMIZERS: Mapping[OptimizerName, Optimizer] = {"sgd": Sgd(), "adam": Adam()}
