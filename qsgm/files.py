@@ -1,21 +1,105 @@
 """Nothing half-written: files and folders appear under their name only when complete.
 
-Both are written beside their destination and renamed. A finished folder lists what it holds in
-``SHA256SUMS``; a folder is replaced only if everything in it is listed there, so that whatever a
-user put into an output folder, and every folder qsgm did not write, survives a wrong ``-o``.
+Both are made in a hidden workshop beside their destination, written to the disk, and take their
+name in one step, the old one's place where there is one. A kill or a power loss at any moment
+leaves the old or the new; a workshop that it leaves behind is swept by whoever writes there next.
+A finished folder lists what it holds in ``SHA256SUMS``; a folder is replaced only if everything in
+it is listed there, so that whatever a user put into an output folder, and every folder qsgm did
+not write, survives a wrong ``-o``.
 """
 
+import errno
 import hashlib
+import io
 import os
+import re
 import secrets
 import shutil
-from collections.abc import Iterator
+import stat
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeGuard, TypeVar
 
 from qsgm.errors import QsgmError
 
+if sys.platform != "win32":
+    import fcntl
+
+Read = TypeVar("Read")
 LISTING = "SHA256SUMS"
+LISTING_BYTES = 4_000_000
+_WORKSHOP = re.compile(r"\.qsgm-[0-9a-f]{16}")
+_NEW, _OLD = "new", "old"
+# How often others may come in between before that is an error.
+_TRIES = 100
+_OVERTAKEN = (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST)
+
+
+def read_file(path: Path, most_bytes: int, expected: str) -> bytes:
+    """Read a regular file that is not larger than a budget; everything else is refused at once.
+
+    Args:
+        path: the file.
+        most_bytes: its budget, checked before it is read and while it is.
+        expected: what should be there, for the message, such as "a PNG or JPEG file".
+
+    Raises:
+        QsgmError: there is no such file, it is none, too large, or cannot be read.
+    """
+    try:
+        with io.BufferedReader(io.FileIO(path, opener=_open_harmlessly)) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise QsgmError(f"{path} is not a regular file: expected {expected}; save it first")
+            size = status.st_size
+            # One byte more shows that it grew; files that the kernel makes up say they have none.
+            data = file.read(size + 1) if size <= most_bytes else b""
+            while data and size < len(data) <= most_bytes and (more := file.read(1 << 20)):
+                data += more
+    except FileNotFoundError as error:
+        raise QsgmError(f"{path} does not exist: expected {expected}; check the name") from error
+    except IsADirectoryError as error:
+        raise QsgmError(f"{path} is a folder: expected {expected}; pass a file in it") from error
+    except (OSError, ValueError, MemoryError) as error:  # ValueError: a name with a null byte
+        raise QsgmError(
+            f"cannot read {path}: {_reason(error)}; expected {expected} that can be read"
+        ) from error
+    if max(size, len(data)) > most_bytes:
+        raise QsgmError(
+            f"{path} has {max(size, len(data)) / 1e6:.7g} MB: expected {expected} of at most "
+            f"{most_bytes / 1e6:.7g} MB; pass a smaller one"
+        )
+    return data
+
+
+def read_whole(folder: Path, load: Callable[[], Read]) -> Read:
+    """What `load` makes of a folder's files; once more where the folder was replaced meanwhile.
+
+    Raises:
+        QsgmError: `load` does, of a folder that stayed as it was.
+    """
+    for _ in range(_TRIES):
+        before = _identity(folder)
+        try:
+            return load()
+        except QsgmError:
+            if before is None:  # a replacement in two steps may have been cut short
+                _sweep(folder.parent)
+            if _identity(folder) == before:
+                raise
+    return load()
+
+
+def is_plain(name: object) -> TypeGuard[str]:
+    """Whether it names a file right in its folder, and fits into a line of a message."""
+    return (
+        isinstance(name, str)
+        and name.isprintable()
+        and not re.search(r"[/\\]", name)
+        and name not in ("", ".", "..")
+    )
 
 
 def write_text_atomic(path: Path, text: str) -> None:
@@ -31,21 +115,18 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
     Raises:
         QsgmError: the place cannot be written to, or is something else than a file.
     """
-    final = path.resolve()
-    temporary = _beside(final, "partial")
+    final = _resolved(path)
     try:
         if final.exists() and not final.is_file():
             raise QsgmError(f"cannot write {path}: it exists and is not a file; pass another name")
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(final)
+        with _workshop(final.parent) as workshop:
+            new = workshop / _NEW
+            new.write_bytes(data)
+            _sync(new)
+            new.replace(final)
+            _sync(final.parent)
     except OSError as error:
         raise _cannot_write(path, error) from error
-    finally:
-        _remove_quietly(temporary)
 
 
 @contextmanager
@@ -64,42 +145,20 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
         QsgmError: `path` holds something that qsgm did not write, or cannot be written.
     """
     check_replaceable(path, marker)
-    temporary = _beside(path.resolve(), "partial")
+    final = _resolved(path)
     try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        replace_folder(temporary, path, marker)
+        with _workshop(final.parent) as workshop:
+            new = workshop / _NEW
+            new.mkdir()
+            yield new
+            if not (new / marker).is_file():
+                raise ValueError(f"{path} cannot be made: {marker} was not written")
+            check_replaceable(path, marker)
+            _write_listing(new)
+            _take_place(new, final)
+            _sync(final.parent)
     except OSError as error:
         raise _cannot_write(path, error) from error
-    finally:
-        _remove_quietly(temporary)
-
-
-def replace_folder(temporary: Path, final: Path, marker: str) -> None:
-    """List the content of `temporary`, then give it the name `final`.
-
-    Raises:
-        QsgmError: `final` holds something that qsgm did not write, or cannot be replaced; it is
-            then as it was before.
-    """
-    if not (temporary / marker).is_file():
-        raise ValueError(f"{temporary} cannot become {final}: {marker} was not written")
-    check_replaceable(final, marker)
-    final = final.resolve()
-    old = _beside(final, "old")
-    try:
-        _write_listing(temporary)
-        if final.exists():
-            final.rename(old)
-        try:
-            temporary.rename(final)
-        except OSError:
-            if old.exists():
-                old.rename(final)
-            raise
-    except OSError as error:
-        raise _cannot_write(final, error) from error
-    _remove_quietly(old)
 
 
 def check_replaceable(path: Path, marker: str) -> None:
@@ -108,26 +167,36 @@ def check_replaceable(path: Path, marker: str) -> None:
     Raises:
         QsgmError: names what stands in the way.
     """
+    final = _resolved(path)
     try:
-        if not path.exists():
+        if not final.exists():
             return
-        if not path.is_dir():
+        if not final.is_dir():
             raise QsgmError(f"cannot write {path}: expected a folder or a new name, got a file")
-        listed = {LISTING, *_listed(path)}
-        foreign = next((name for name in _entries(path) if name not in listed), None)
-        empty = next(_entries(path), None) is None
+        foreign, empty = _foreign_entry(final), next(_entries(final), None) is None
+        reason = None
+        if Path.cwd().is_relative_to(final):
+            reason = "it is or holds the working folder"
+        elif foreign is not None:
+            reason = f"qsgm did not write {foreign!r} in it"
+        elif not empty and not (final / marker).is_file():
+            reason = f"it holds another kind of output (no {marker})"
     except OSError as error:
         raise _cannot_write(path, error) from error
-    if foreign is not None:
+    if reason is not None:
         raise QsgmError(
-            f"will not replace the folder {path}: qsgm did not write {foreign!r} in it; "
-            f"pass a new or an empty folder"
+            f"will not replace the folder {path}: {reason}; pass a new or an empty folder"
         )
-    if not empty and not (path / marker).is_file():
-        raise QsgmError(
-            f"will not replace the folder {path}: it holds another kind of output (no {marker}); "
-            f"pass a new or an empty folder"
-        )
+
+
+def _foreign_entry(folder: Path) -> str | None:
+    """The first thing in a folder that its listing does not name."""
+    try:
+        text = read_file(folder / LISTING, LISTING_BYTES, "a listing").decode()
+    except (QsgmError, UnicodeDecodeError):
+        text = ""
+    listed = {LISTING, *(line.partition("  ")[2] for line in text.splitlines())}
+    return next((name for name in _entries(folder) if name not in listed), None)
 
 
 def _entries(folder: Path) -> Iterator[str]:
@@ -145,40 +214,167 @@ def _entries(folder: Path) -> Iterator[str]:
                 yield item.relative_to(folder).as_posix()
 
 
-def _listed(folder: Path) -> set[str]:
-    """Relative names that a folder's listing gives; none without a listing."""
-    try:
-        lines = (folder / LISTING).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return set()
-    return {name for _, separator, name in (line.partition("  ") for line in lines) if separator}
-
-
 def _write_listing(folder: Path) -> None:
-    """Write the listing in the format of ``sha256sum``, so that ``sha256sum -c`` checks it."""
+    """Write the listing in the format of ``sha256sum``, and everything to the disk."""
+    names = sorted({*_entries(folder)} - {LISTING})
     lines = [
-        f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n"
-        for name in sorted({*_entries(folder)} - {LISTING})
+        f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names
     ]
     (folder / LISTING).write_text("".join(lines), encoding="utf-8")
+    for path in (folder, *folder.rglob("*")):
+        _sync(path)
 
 
-def _beside(path: Path, kind: str) -> Path:
-    """An unused hidden name in the same folder, hence on the same disk."""
-    if not path.name:
-        raise QsgmError(f"cannot write {path}: it has no name of its own; pass a place below it")
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{kind}")
+@contextmanager
+def _workshop(place: Path) -> Iterator[Path]:
+    """A hidden folder in `place`, which is made; it is this process's while the block runs."""
+    _make_folder(place)
+    _sweep(place)
+    lock, there = None, False
+    while not there:  # who sweeps may take it for a stale one until it is locked
+        folder = place / f".qsgm-{secrets.token_hex(8)}"
+        folder.mkdir()
+        with suppress(OSError):  # a system without locks: nobody can sweep there either
+            lock = _lock(folder, wait=True)
+        there = folder.exists()
+    try:
+        yield folder
+    finally:
+        _clear(folder)
+        if lock is not None:
+            os.close(lock)
 
 
-def _remove_quietly(path: Path) -> None:
-    """Clean up; a failure here must not hide what went wrong before, or undo what went well."""
+def _lock(folder: Path, *, wait: bool) -> int:
+    """A descriptor that holds a folder's lock until it is closed or its process ends."""
+    if sys.platform == "win32":
+        raise OSError("folders have no locks here")
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _sweep(place: Path) -> None:
+    """Clear workshops whose processes are gone, however they ended: their locks are free."""
     with suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        for folder in place.glob(".qsgm-*"):
+            with suppress(OSError):
+                if _WORKSHOP.fullmatch(folder.name):
+                    lock = _lock(folder, wait=False)
+                    _clear(folder)
+                    os.close(lock)
 
 
-def _cannot_write(path: Path, error: OSError) -> QsgmError:
-    reason = (error.strerror or str(error)).lower()
-    return QsgmError(f"cannot write {path}: {reason}; pass a place that can be written to")
+def _clear(workshop: Path) -> None:
+    """Bring back what was to be replaced and was not, and remove the rest.
+
+    A failure here must not hide what went wrong before, or undo what went well.
+    """
+    with suppress(OSError):
+        for old in (workshop / _OLD).glob("*"):
+            if not (workshop.parent / old.name).exists():
+                old.rename(workshop.parent / old.name)
+        _sync(workshop.parent)
+    shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _take_place(new: Path, final: Path) -> None:
+    """Give a folder its name, or let it change places with what has that name.
+
+    Others may do the same at the same time: the last one's stays.
+    """
+    for last in (*[False] * _TRIES, True):
+        try:
+            if not final.exists():
+                new.rename(final)
+            elif not _exchange(new, final):
+                _replace_in_two_steps(new, final)
+            return
+        except OSError as error:
+            if last or error.errno not in _OVERTAKEN:
+                raise
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two names change places in one step; False where the system cannot."""
+    import ctypes
+
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, TypeError, OSError):
+        return False
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    if rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        return False
+    raise OSError(code, os.strerror(code))
+
+
+def _replace_in_two_steps(new: Path, final: Path) -> None:
+    """Between the steps there is nothing under the name; whatever happens, the old comes back."""
+    old = new.with_name(_OLD) / final.name
+    old.parent.mkdir(exist_ok=True)
+    try:
+        final.rename(old)
+        new.rename(final)
+    finally:
+        if old.exists() and not final.exists():
+            old.rename(final)
+
+
+def _make_folder(path: Path) -> None:
+    """Make a folder and those on the way to it, all of them on the disk."""
+    if not path.is_dir():
+        _make_folder(path.parent)
+        path.mkdir(exist_ok=True)
+        _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    """Write a file or the names in a folder to the disk."""
+    if sys.platform == "win32":  # where only what is open for writing can be
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some cannot do this with folders
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _open_harmlessly(path: str, flags: int) -> int:
+    """Open without waiting for a pipe's other end, or becoming a terminal's process."""
+    harmless = (getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY"))  # not everywhere
+    return os.open(path, flags | sum(harmless))
+
+
+def _identity(folder: Path) -> tuple[int, ...] | None:
+    """What differs between a folder and one that has replaced it; None without one."""
+    try:
+        status = folder.stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a null byte
+        raise _cannot_write(path, error) from error
+
+
+def _cannot_write(path: Path, error: Exception) -> QsgmError:
+    return QsgmError(f"cannot write {path}: {_reason(error)}; pass a place that can be written to")
+
+
+def _reason(error: Exception) -> str:
+    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).lower()

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from qsgm import files
 from qsgm.errors import QsgmError
 from qsgm.files import (
     LISTING,
     new_folder,
-    replace_folder,
     write_bytes_atomic,
     write_text_atomic,
 )
@@ -189,33 +189,46 @@ def test_a_file_that_appears_while_the_block_runs_is_kept(tmp_path: Path) -> Non
     assert names(tmp_path) == ["mug"]
 
 
-def test_when_the_last_rename_fails_the_old_folder_comes_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (OSError(5, "Input/output error"), QsgmError("input/output error")),
+        (KeyboardInterrupt(), KeyboardInterrupt()),
+    ],
+)
+def test_whatever_ends_a_replacement_in_two_steps_the_old_folder_comes_back(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    expected: BaseException,
 ) -> None:
     write_object(tmp_path / "mug", "old")
     rename = Path.rename
 
     def fails_for_the_new_one(self: Path, target: Path) -> Path:
-        if self.name.endswith(".partial"):
-            raise OSError(5, "Input/output error")
+        if self.name == "new":
+            raise error
         return rename(self, target)
 
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)
     monkeypatch.setattr(Path, "rename", fails_for_the_new_one)
-    with pytest.raises(QsgmError, match="input/output error"):
+    with pytest.raises(type(expected), match=str(expected) or None):
         write_object(tmp_path / "mug", "new")
     assert (tmp_path / "mug" / MARKER).read_text() == "old"
     assert names(tmp_path) == ["mug"]
 
 
 def test_a_folder_without_its_marker_is_a_programming_error(tmp_path: Path) -> None:
-    (tmp_path / "temporary").mkdir()
-    with pytest.raises(ValueError, match=f"{MARKER} was not written"):
-        replace_folder(tmp_path / "temporary", tmp_path / "final", MARKER)
-    assert not (tmp_path / "final").exists()
+    with (
+        pytest.raises(ValueError, match=f"{MARKER} was not written"),
+        new_folder(tmp_path / "final", MARKER),
+    ):
+        pass
+    assert names(tmp_path) == []
 
 
 def test_a_place_without_a_name_is_refused_in_one_line() -> None:
-    with pytest.raises(QsgmError, match="cannot write /: it has no name"):
+    with pytest.raises(QsgmError, match="cannot write /: it exists and is not a file"):
         write_bytes_atomic(Path("/"), b"x")
     assert "will not replace the folder /" in refusal(Path("/"))
 
