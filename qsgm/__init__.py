@@ -20,6 +20,9 @@ from qsgm.errors import QsgmError
 # Python imports a package before any of its modules; whoever imports ONNX Runtime before qsgm has
 # to set it. A setting of the user's own stays.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+# OpenCV reads this when it is loaded. Four times the largest frame, since the process is not only
+# qsgm's: headers are checked before, and this is for what a decoder sees in a file and they do not.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle, load_bundle

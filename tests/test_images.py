@@ -1,6 +1,9 @@
 """Whatever a user passes is read as a frame or refused in one line."""
 
+import os
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.images import check_demonstration, read_demonstration, read_frame, write_png
+from qsgm.images import check_demonstration, check_frame, read_demonstration, read_frame, write_png
 
 
 def picture(height: int = 480, width: int = 640) -> NDArray[np.uint8]:
@@ -120,23 +123,169 @@ def test_a_file_that_is_no_picture_is_refused(at: Path, content: bytes) -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("kept", [0.0005, 0.01, 0.3, 0.9, 0.999])
-def test_a_truncated_picture_is_refused_in_one_line_before_it_is_decoded(
-    at: Path, suffix: str, kept: float, monkeypatch: pytest.MonkeyPatch
+def test_a_truncated_picture_is_refused_in_one_line_and_nothing_else(
+    at: Path, suffix: str, kept: float, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    # Some decoders fill up what is missing, others complain on stderr: none is to see it.
     whole = encoded(picture(), suffix)
     at.write_bytes(whole[: max(9, int(len(whole) * kept))])
+    assert "is truncated or damaged" in refusal(at)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_truncated_png_is_refused_before_it_is_decoded(
+    at: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at.write_bytes(encoded(picture())[:-1])
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("must not decode"))
     assert "is truncated or damaged" in refusal(at)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_a_picture_without_the_last_byte_is_refused_in_silence(
-    at: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("missing", [1, 2])
+def test_a_whole_jpeg_that_lacks_only_its_end_mark_is_read(at: Path, missing: int) -> None:
+    whole = encoded(picture(), ".jpg")
+    at.write_bytes(whole)
+    frame = read_frame(at)
+    at.write_bytes(whole[:-missing])
+    np.testing.assert_array_equal(read_frame(at), frame)
+
+
+def test_a_progressive_jpeg_without_its_end_mark_may_lack_scans_and_is_refused(at: Path) -> None:
+    flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    at.write_bytes(bytes(cv2.imencode(".jpg", picture(), flags)[1])[:-2])
+    assert "is truncated or damaged" in refusal(at)
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+@pytest.mark.parametrize("filled", [b"", bytes(2000)])
+def test_a_jpeg_with_a_hole_and_an_end_mark_is_refused_in_silence(
+    at: Path, progressive: int, filled: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    at.write_bytes(encoded(picture(), suffix)[:-1])
+    # What a USB camera gives that lost a packet.
+    flags = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
+    whole = bytes(cv2.imencode(".jpg", picture(), flags)[1])
+    middle = len(whole) // 2
+    at.write_bytes(whole[:middle] + filled + whole[middle + 2000 :])
     assert "is truncated or damaged" in refusal(at)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_say_while_a_picture_is_decoded_reaches_stderr(
+    at: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    decode = cv2.imdecode
+
+    def noisy(*arguments: Any) -> Any:
+        os.write(2, b"libpng warning: iCCP: known incorrect sRGB profile\nmotor 3 is hot\n")
+        return decode(*arguments)
+
+    monkeypatch.setattr(cv2, "imdecode", noisy)
+    at.write_bytes(encoded(picture()))
+    assert read_frame(at).shape == (480, 640, 3)
+    assert capfd.readouterr() == ("", "motor 3 is hot\n")
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_a_sensors_bits_in_sixteen_keep_their_own_high_byte(at: Path, bits: int) -> None:
+    image = picture().astype(np.uint16) << (bits - 8)
+    at.write_bytes(encoded(image))
+    np.testing.assert_array_equal(read_demonstration(at), picture())
+
+
+def png_of(*chunks: tuple[bytes, bytes]) -> bytes:
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*chunk) for chunk in chunks)
+
+
+def png_header(width: int, height: int) -> tuple[bytes, bytes]:
+    return b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+
+
+def jpeg_header(width: int, height: int) -> bytes:
+    return b"\xff\xc0" + struct.pack(">HBHHB", 8 + 3 * 3, 8, height, width, 3) + bytes(9)
+
+
+def hidden_sizes() -> dict[str, bytes]:
+    """Files that show one size to who reads the last header, another to who reads the first."""
+    whole = encoded(picture(256, 256), ".jpg")
+    frame = whole.index(b"\xff\xc0")
+    scan = whole.index(b"\xff\xda")
+    small, large = png_header(300, 300), png_header(40000, 40000)
+    data, end = (b"IDAT", zlib.compress(b"\0" * 100)), (b"IEND", b"")
+    scans = whole[scan:-2]
+    return {
+        "a second IHDR": png_of(large, small, data, end),
+        "an IHDR that does not come first": png_of((b"tEXt", b"a\0b"), large, data, end),
+        "no IHDR": png_of(data, end),
+        "an IHDR of another length": png_of((b"IHDR", small[1] + b"\0"), data, end),
+        "a second SOF": whole[:frame] + jpeg_header(40000, 40000) + whole[frame:],
+        "a SOF behind the scan": whole[:-2] + jpeg_header(300, 300) + whole[-2:],
+        "a scan without a SOF": whole[:frame] + whole[scan:],
+        "no scan": whole[:scan] + whole[-2:],
+        "scans without end": whole[:-2] + scans * 200 + whole[-2:],
+    }
+
+
+@pytest.mark.parametrize("kind", hidden_sizes())
+def test_a_size_that_is_hidden_from_the_check_is_refused_before_anything_is_decoded(
+    at: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("must not decode"))
+    at.write_bytes(hidden_sizes()[kind])
+    assert "is truncated or damaged" in refusal(at)
+
+
+def test_the_decoder_is_bounded_as_well() -> None:
+    # In a process of its own: OpenCV reads the bound when it is loaded.
+    script = """
+import qsgm, cv2, numpy as np
+for side in (4096, 9000):
+    encoded = cv2.imencode(".png", np.zeros((side, side), np.uint8))[1]
+    try:
+        print(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) is not None)
+    except cv2.error:
+        print(False)
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "OPENCV_IO_MAX_IMAGE_PIXELS"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True", "False"]
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        None,
+        "scene.png",
+        np.zeros((480, 640), np.uint8),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((480, 640, 3), np.float32),
+        np.zeros((480, 640, 3), bool),
+        np.zeros((3, 480, 640), np.uint8),
+        np.zeros((1, 480, 640, 3), np.uint8),
+        np.zeros((0, 640, 3), np.uint8),
+        np.zeros((1, 5000, 3), np.uint8),
+        np.array(3, np.uint8),
+    ],
+    ids=lambda frame: str(getattr(frame, "shape", frame)),
+)
+def test_an_array_that_is_no_frame_is_refused_in_one_line_that_blames_it(frame: Any) -> None:
+    with pytest.raises(QsgmError, match=r"^the frame is .*: expected .*; ") as raised:
+        check_frame(frame)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_frame_seen_in_a_mirror_is_a_frame() -> None:
+    mirrored = picture()[:, ::-1, ::-1]
+    checked = check_frame(mirrored)
+    assert checked.flags["C_CONTIGUOUS"]
+    np.testing.assert_array_equal(checked, mirrored)
+
+
+@pytest.mark.parametrize("name", ["picture.jpg", "picture", "picture.png.txt"])
+def test_a_picture_under_the_name_of_another_format_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(QsgmError, match=r"pictures are PNG; pass a name that ends in \.png"):
+        write_png(tmp_path / name, picture())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_bytes_after_the_end_mark_do_not_matter(at: Path) -> None:
@@ -234,5 +383,6 @@ def test_a_written_png_reads_back_exactly(tmp_path: Path) -> None:
 
 
 def test_a_picture_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "folder.png").mkdir()
     with pytest.raises(QsgmError, match="cannot write"):
-        write_png(tmp_path, picture())
+        write_png(tmp_path / "folder.png", picture())
