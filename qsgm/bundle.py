@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 
 from qsgm.blocks import Blocks, one_block, parse_blocks
 from qsgm.errors import QsgmError
+from qsgm.files import read_file, read_whole
 from qsgm.manifest import (
     COMMAND,
+    FORMAT,
     MANIFEST,
+    MANIFEST_BYTES,
     NETWORK,
+    VERSION,
     WEIGHTS,
     Manifest,
     Method,
@@ -23,12 +27,15 @@ from qsgm.manifest import (
     Place,
     Recipe,
     default_blocks,
-    read_manifest,
+    manifest_from,
+    parse_description,
 )
 from qsgm.network import Network
 from qsgm.runtime import open_session
 from qsgm.sgm.float import FoldedConv, FoldedSgm
 from qsgm.sgm.int8 import ActivationBits
+
+MOST_BYTES = 256_000_000  # of all files of a bundle
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,7 @@ class Bundle:
 
     folder: Path
     manifest: Manifest
+    contents: Mapping[str, bytes] = field(default_factory=dict, repr=False)  # by file
 
     @property
     def network(self) -> Network:
@@ -48,8 +56,14 @@ class Bundle:
         return name in self.manifest.files
 
     def read(self, name: str) -> bytes:
-        """A whole file. Raises QsgmError where the bundle was made without it."""
-        return self.graph_path(name).read_bytes()
+        """A whole file as it was when the bundle was loaded, whatever is in its place by now.
+
+        Raises QsgmError where the bundle was made without it.
+        """
+        path = self.folder / name if name == MANIFEST else self.graph_path(name)
+        if name in self.contents:
+            return self.contents[name]
+        return read_file(path, MOST_BYTES, f"a file that `{COMMAND}` wrote")
 
     def check_blocks(self, blocks: Blocks) -> None:
         """Refuse what the bundle has no step for.
@@ -109,7 +123,10 @@ class Bundle:
 
         `constants` take the place of the graph's own, by initializer name.
         """
-        return open_session(self.graph_path(name), threads, constants or {})
+        files = {file: self.read(file) for file in (WEIGHTS, NETWORK)}
+        return open_session(
+            self.read(name), threads, constants or {}, files, str(self.folder / name)
+        )
 
     def graph_path(self, name: str) -> Path:
         """The file of a graph. Raises QsgmError where the bundle was made without it."""
@@ -131,7 +148,7 @@ class Bundle:
 
     def float_sgm(self, layer: int) -> FoldedSgm:
         """The SGM behind a layer before it was quantized."""
-        data = (self.folder / WEIGHTS).read_bytes()
+        data = self.read(WEIGHTS)
         convs = (
             FoldedConv(array_at(data, weight), array_at(data, bias))
             for weight, bias in self.manifest.sgms[layer].convolutions
@@ -140,13 +157,13 @@ class Bundle:
 
     def start_weights(self, layers: range) -> dict[str, NDArray[np.float32]]:
         """Starting weights (Co, Ci, kh, kw) and biases (Co,) of some layers, by name."""
-        data = (self.folder / NETWORK).read_bytes()
+        data = self.read(NETWORK)
         names = [f"{kind}{k}" for k in layers for kind in ("weight", "bias")]
         return {name: array_at(data, self.manifest.initializers[name]) for name in names}
 
     def network_with(self, weights: dict[str, NDArray[np.float32]]) -> bytes:
         """The whole network as an ONNX file with these weights in the place of its own."""
-        data = bytearray((self.folder / NETWORK).read_bytes())
+        data = bytearray(self.read(NETWORK))
         for name, value in weights.items():
             place = self.manifest.initializers[name]
             if value.shape != place.shape:
@@ -157,7 +174,7 @@ class Bundle:
 
     def sha256(self) -> str:
         """Digest of the manifest, and so of everything in the bundle."""
-        return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
+        return hashlib.sha256(self.read(MANIFEST)).hexdigest()
 
 
 def array_at(data: bytes, place: Place) -> NDArray[np.float32]:
@@ -173,16 +190,20 @@ def load_bundle(folder: Path) -> Bundle:
     Raises:
         QsgmError: a file is missing or altered, or this is no bundle.
     """
-    manifest = read_manifest(folder)
+    return read_whole(folder, lambda: _load_bundle(folder))
+
+
+def _load_bundle(folder: Path) -> Bundle:
+    path = folder / MANIFEST
+    data = read_file(path, MANIFEST_BYTES, f"a bundle written by `{COMMAND}`")
+    manifest = manifest_from(parse_description(data, path, FORMAT, (VERSION,), COMMAND), path)
+    contents, left = {MANIFEST: data}, MOST_BYTES
     for name, expected in manifest.files.items():
-        path = folder / name
-        if not path.is_file():
+        contents[name] = read_file(folder / name, left, f"a file that `{COMMAND}` wrote")
+        left -= len(contents[name])
+        if hashlib.sha256(contents[name]).hexdigest() != expected.sha256:
             raise QsgmError(
-                f"the bundle {folder} lacks {name}; export it again with `qsgm fold-and-quantize`"
+                f"{folder / name} is not the file the manifest describes (its sha256 differs); "
+                f"export the bundle again with `{COMMAND}`"
             )
-        if hashlib.sha256(path.read_bytes()).hexdigest() != expected.sha256:
-            raise QsgmError(
-                f"{path} is not the file the manifest describes (its sha256 differs); "
-                "export the bundle again with `qsgm fold-and-quantize`"
-            )
-    return Bundle(folder, manifest)
+    return Bundle(folder, manifest, contents)

@@ -97,7 +97,7 @@ def decode_frame(data: bytes, path: Path) -> NDArray[np.uint8]:
     if not header.ended:
         data += bytes([0xFF, _JPEG_END])
     decoded = None
-    with _complaints() as complaints:
+    with decoding() as complaints:
         try:
             flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
             decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
@@ -186,7 +186,7 @@ def check_png_name(path: Path) -> None:
 
 
 @contextmanager
-def _complaints() -> Iterator[list[bytes]]:
+def decoding() -> Iterator[list[bytes]]:
     """What decoders say on stderr while this block runs; what others say there is passed on."""
     lines: list[bytes] = []
     with _stderr_lock:

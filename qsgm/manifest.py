@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar, get_args
 from qsgm import defaults
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.errors import QsgmError
+from qsgm.files import is_plain, read_file
 from qsgm.network import Network
 from qsgm.schedule import short_run_factor
 from qsgm.sgm.int8 import ACTIVATION_BITS, ActivationBits
@@ -25,6 +26,7 @@ VERSION = 5
 NETWORK = "network.onnx"
 WEIGHTS = "weights.bin"
 FLOAT_BYTES = 4
+MANIFEST_BYTES = 4_000_000
 COMMAND = "qsgm fold-and-quantize"
 
 Method = Literal["sgm", "bp"]
@@ -160,7 +162,8 @@ def read_manifest(folder: Path) -> Manifest:
             names the first key that is wrong.
     """
     path = folder / MANIFEST
-    return manifest_from(read_description(path, FORMAT, (VERSION,), COMMAND), path)
+    data = read_file(path, MANIFEST_BYTES, f"a bundle written by `{COMMAND}`")
+    return manifest_from(parse_description(data, path, FORMAT, (VERSION,), COMMAND), path)
 
 
 def manifest_from(values: Mapping[str, Any], path: Path) -> Manifest:
@@ -226,27 +229,24 @@ def size_of(manifest: Path, name: str) -> float:
     return path.stat().st_size if path.is_file() else math.inf
 
 
-def read_description(
-    path: Path, kind: str, versions: Sequence[int], command: str
+def parse_description(
+    data: bytes, path: Path, kind: str, versions: Sequence[int], command: str
 ) -> dict[str, Any]:
-    """Read a folder's JSON description and check that it is of the expected kind.
+    """A folder's JSON description, if it is of the expected kind.
 
     Args:
-        path: of the description.
+        data: the description's bytes.
+        path: of the description, for the message.
         kind: expected value of its key `format`.
         versions: expected values of its key `version`, the newest last.
         command: what the user runs to make such a folder.
 
     Raises:
-        QsgmError: it is missing, not JSON, or describes something else.
+        QsgmError: it is not JSON, or describes something else.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise QsgmError(
-            f"{path.parent} holds no {path.name}; expected a folder written by `{command}`"
-        ) from error
-    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, nested without end
+        values = json.loads(str(data, "utf-8"))
+    except (ValueError, RecursionError, MemoryError) as error:  # not UTF-8, not JSON, no end
         raise QsgmError(f"{path} is not JSON; make it again with `{command}`") from error
     got = (values.get("format"), values.get("version")) if isinstance(values, dict) else None
     if got not in [(kind, version) for version in versions]:
@@ -407,7 +407,7 @@ def _files_from(values: Any) -> Mapping[str, FileEntry]:
     found = {}
     for name, one in values.items():
         peak = one.get("peak_activation_bytes")
-        _require(name, Path(name).name == name and name not in (".", ".."))
+        _require(name, is_plain(name))
         _require(one, isinstance(one["sha256"], str) and (peak is None or type(peak) is int))
         found[name] = FileEntry(one["sha256"], peak)
     return MappingProxyType(found)

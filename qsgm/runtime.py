@@ -1,8 +1,7 @@
 """Stock ONNX Runtime sessions with this project's settings."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -10,19 +9,27 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_native
 
-from qsgm.errors import QsgmError
+from qsgm.errors import QsgmError, as_text
+from qsgm.external_data import check_external_data
+
+# A value's type as ONNX Runtime names it, and its shape; None for a side of any length.
+Value = tuple[str, Sequence[int | None]]
 
 _CONFIG = {
+    # Not by looking at the bytes: the other format is not the one that was checked.
+    "session.load_model_format": "ONNX",
     # Spinning threads starve whatever else runs on a small device, and buy nothing at this size.
     "session.intra_op.allow_spinning": "0",
     "session.inter_op.allow_spinning": "0",
 }
-_NONE: Mapping[str, NDArray[Any]] = MappingProxyType({})
+_NO_ARRAYS: Mapping[str, NDArray[Any]] = MappingProxyType({})
+_NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 # What a graph raises when it runs: ONNX Runtime's own types have no common one, and its Python
 # side raises ValueError (an input is missing) and RuntimeError (a name is unknown).
 _RUN_ERRORS: tuple[type[Exception], ...] = (
     ValueError,
     RuntimeError,
+    MemoryError,
     *(
         kind
         for kind in vars(ort_native).values()
@@ -57,34 +64,80 @@ def run_options(*, whole_graph: bool = True, give_memory_back: bool = False) -> 
 
 
 def open_session(
-    model: Path | bytes, threads: int = 1, constants: Mapping[str, NDArray[Any]] = _NONE
+    model: bytes,
+    threads: int = 1,
+    constants: Mapping[str, NDArray[Any]] = _NO_ARRAYS,
+    files: Mapping[str, bytes] = _NO_FILES,
+    name: str = "a graph",
 ) -> ort.InferenceSession:
-    """A CPU session of an ONNX file or of its bytes.
+    """A CPU session of an ONNX file's bytes; no file is opened for it.
 
     Args:
-        model: whose external data, if it has any, lies beside its file.
+        model: an ONNX file's content.
         threads: for each operator.
         constants: in the place of the model's own external ones, by initializer name.
+        files: in which the model keeps numbers, by name; it may name no others.
+        name: of the model, for the message.
 
     Raises:
-        QsgmError: ONNX Runtime does not accept the model.
+        QsgmError: ONNX Runtime does not accept the model, or it names other files.
     """
-    source = model if isinstance(model, bytes) else str(model)
     try:
+        check_external_data(model, files)
         options = session_options(threads)
         # Not add_initializer: that one comes after the optimizer has made constants of constants.
         values = [ort.OrtValue.ortvalue_from_numpy(array) for array in constants.values()]
         options.add_external_initializers([*constants], values)
-        session = ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        contents = [*files.values()]
+        options.add_external_initializers_from_files_in_memory(
+            [*files], contents, [len(content) for content in contents]
+        )
+        session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         # The session may read their memory as long as it lives.
-        session.constants = constants, values
+        session.constants = constants, values, contents
         return session
     except Exception as error:  # ORT raises several unrelated types
-        name = "a graph" if isinstance(model, bytes) else f"{model}"
         raise QsgmError(
             f"ONNX Runtime {ort.__version__} cannot load {name} ({_first_line(error)}); "
             "export the bundle again with `qsgm fold-and-quantize`"
         ) from error
+
+
+def check_interface(
+    session: ort.InferenceSession,
+    name: str,
+    inputs: Mapping[str, Value],
+    outputs: Mapping[str, Value],
+    advice: str,
+) -> None:
+    """Refuse a graph that takes anything else than these inputs, or lacks one of these outputs.
+
+    Raises:
+        QsgmError: says what the graph called `name` takes or gives; ends with `advice`.
+    """
+    for verb, wanted, values in (
+        ("takes", inputs, session.get_inputs()),
+        ("gives", outputs, session.get_outputs()),
+    ):
+        there = {value.name: (value.type, value.shape) for value in values}
+        extra = verb == "takes" and there.keys() - wanted.keys()
+        if extra or not all(key in there and _fits(there[key], wanted[key]) for key in wanted):
+            raise QsgmError(
+                f"{name} {verb} {as_text(str(there))}, expected {dict(wanted)}; {advice}"
+            )
+
+
+def _fits(got: Value, wanted: Value) -> bool:
+    """Whether the types are the same, and the shapes where both say a number."""
+    (kind, shape), (wanted_kind, wanted_shape) = got, wanted
+    return (
+        kind == wanted_kind
+        and len(shape) == len(wanted_shape)
+        and all(
+            expected in (side, None) or not isinstance(side, int)
+            for side, expected in zip(shape, wanted_shape, strict=True)
+        )
+    )
 
 
 @contextmanager
@@ -103,4 +156,4 @@ def running(what: str, advice: str) -> Iterator[None]:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

@@ -125,7 +125,9 @@ def refusal(folder: Path) -> str:
 
 def test_a_missing_graph_is_named(own_bundle: Path) -> None:
     (own_bundle / trunk_file("float", 2)).unlink()
-    assert "lacks trunk_float_2.onnx; export it again" in refusal(own_bundle)
+    assert "trunk_float_2.onnx does not exist: expected a file that `qsgm fold-and-q" in refusal(
+        own_bundle
+    )
 
 
 def test_a_graph_altered_by_one_bit_is_named(own_bundle: Path) -> None:
@@ -155,7 +157,7 @@ def test_a_manifest_of_something_else_is_refused(
 
 
 def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
-    assert "holds no manifest.json" in refusal(tmp_path)
+    assert "manifest.json does not exist: expected a bundle" in refusal(tmp_path)
 
 
 def test_a_graph_that_the_runtime_cannot_load_is_refused(own_bundle: Path) -> None:

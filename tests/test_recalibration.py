@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from qsgm import QsgmError, cli
@@ -54,7 +53,7 @@ def random_seen(rng: np.random.Generator, side: int) -> FloatArray:
     )
 
 
-def write_graph(q: QuantizedSgm, side: int, folder: Path) -> Path:
+def write_graph(q: QuantizedSgm, side: int) -> tuple[bytes, dict[str, bytes]]:
     """The SGM alone as a graph, its constants in a file beside it."""
     graph = Graph("sgm")
     op = graph.within(f"layer{q.layer}")
@@ -65,37 +64,34 @@ def write_graph(q: QuantizedSgm, side: int, folder: Path) -> Path:
     graph.output("gradient", gradient, np.float32, ("batch", *shape))
     model, shared = graph.model(), SharedConstants("weights.bin")
     shared.take_from([model])
-    (folder / "weights.bin").write_bytes(shared.data)
-    onnx.save(model, folder / "sgm.onnx")
-    return folder / "sgm.onnx"
+    return model.SerializeToString(), {"weights.bin": bytes(shared.data)}
 
 
 @KERNELS
 def test_exchanged_constants_make_the_graph_the_other_sgm_bit_for_bit(
-    kernel: int, side: int, tmp_path: Path
+    kernel: int, side: int
 ) -> None:
     rng = np.random.default_rng(0)
     sgm = random_sgm(rng, kernel)
     seen = random_seen(rng, side)
     own, other = (quantize_sgm(sgm, ranges_of(sgm, scale * seen[..., :8])) for scale in (0.01, 1.0))
-    path = write_graph(own, side, tmp_path)
-    for q, session in ((own, open_session(path)), (other, open_session(path, 1, constants(other)))):
+    graph, files = write_graph(own, side)
+    for q, exchanged in ((own, {}), (other, constants(other))):
+        session = open_session(graph, 1, exchanged, files)
         gradient = session.run(None, {"seen": seen})[0]
         np.testing.assert_array_equal(gradient, integer_forward(q, seen)[0])
 
 
 @KERNELS
-def test_a_graph_of_two_planes_gives_the_gradients_of_8_bit_sgms(
-    kernel: int, side: int, tmp_path: Path
-) -> None:
+def test_a_graph_of_two_planes_gives_the_gradients_of_8_bit_sgms(kernel: int, side: int) -> None:
     rng = np.random.default_rng(1)
     sgm = random_sgm(rng, kernel)
     seen = random_seen(rng, side)
     ranges = ranges_of(sgm, seen[..., :8])
-    path = write_graph(quantize_sgm(sgm, ranges), side, tmp_path)
+    graph, files = write_graph(quantize_sgm(sgm, ranges), side)
     for weight_bits in (16, 8, 4):
         q = quantize_sgm(sgm, ranges, 8, weight_bits)
-        session = open_session(path, 1, constants_of_two_planes(q))
+        session = open_session(graph, 1, constants_of_two_planes(q), files)
         gradient = session.run(None, {"seen": seen})[0]
         np.testing.assert_array_equal(gradient, integer_forward(q, seen)[0])
 

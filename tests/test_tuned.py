@@ -2,8 +2,12 @@
 
 import json
 import math
+import pickle
+from collections.abc import Callable
+from copy import copy, deepcopy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from toys import bump, by_correlation, lay, table, toy
 
 from qsgm import QsgmError, load_object
 from qsgm.bundle import Bundle
+from qsgm.grasp import tuned as tuned_module
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.heatmap import Detection, Place, locate, refine
 from qsgm.grasp.patch import cut_patch
@@ -82,9 +87,9 @@ def test_a_folder_with_something_else_in_it_is_left_alone(bundle: Bundle, tmp_pa
 
 def test_a_missing_or_altered_network_is_refused(saved: Path) -> None:
     (saved / NETWORK).write_bytes((saved / NETWORK).read_bytes()[:-1] + b"x")
-    assert "missing or altered; tune the object again" in refusal(saved)
+    assert "network.onnx is altered: its sha256 differs; tune the object again" in refusal(saved)
     (saved / NETWORK).unlink()
-    assert "missing or altered" in refusal(saved)
+    assert "network.onnx does not exist" in refusal(saved)
 
 
 @pytest.mark.parametrize("content", ["", "nonsense", "{}", '{"format": "qsgm-bundle"}'])
@@ -94,7 +99,7 @@ def test_another_description_is_refused(saved: Path, content: str) -> None:
 
 
 def test_a_folder_that_is_no_object_is_refused(tmp_path: Path) -> None:
-    assert "holds no object.json" in refusal(tmp_path)
+    assert "object.json does not exist: expected an object" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("key", ["name", "encoding", "offset_rad", "sha256"])
@@ -120,11 +125,12 @@ def test_a_description_that_says_nonsense_is_refused(saved: Path, key: str, valu
 def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Path) -> None:
     save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_float_6.onnx").read_bytes(), {})
     text = refusal(tmp_path / "mug")
-    assert "takes ['crops'] and gives ['features'], expected a frame and its heatmap" in text
+    assert "takes {'crops': ('tensor(uint8)', " in text
+    assert "expected {'frame': ('tensor(uint8)', (None, None, 3))}; tune the object again" in text
 
 
 def test_a_frame_that_does_not_fit_the_network_is_refused(saved: Path) -> None:
-    with pytest.raises(QsgmError, match=r"does not fit .*; tune the object again"):
+    with pytest.raises(QsgmError, match=r"the frame is an array of uint8 .*: expected"):
         load_object(saved).heatmap(np.zeros((128, 128, 5), np.uint8))
 
 
@@ -153,6 +159,17 @@ def described(
     view = View(cut_patch(frame, CENTER), 0.0, whole=True)
     chosen = by_correlation() if decision is None else decision
     return ObjectDescription("toy", "double", 0.0, scale, (view,), chosen, {"seed": 4})
+
+
+def named(name: str) -> ObjectDescription:
+    return replace(described(), name=name)
+
+
+def other_network(bundle: Bundle) -> bytes:
+    """The bundle's with one weight changed."""
+    weights = bundle.start_weights(1)
+    weights["bias6"] = weights["bias6"] + 1
+    return bundle.network_with(weights)
 
 
 def turn_error(got: float | None, expected: float, circle: float = 360) -> float:
@@ -400,9 +417,11 @@ def test_a_missing_or_altered_patch_is_refused(bundle: Bundle, tmp_path: Path) -
     save_object(tmp_path / "toy", described(), bundle.network_with({}), {})
     path = tmp_path / "toy" / "patch.png"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert "patch.png is missing or altered; tune the object again" in refusal(tmp_path / "toy")
+    assert "patch.png is altered: its sha256 differs; tune the object again" in refusal(
+        tmp_path / "toy"
+    )
     path.unlink()
-    assert "patch.png is missing or altered" in refusal(tmp_path / "toy")
+    assert "patch.png does not exist" in refusal(tmp_path / "toy")
 
 
 @pytest.mark.parametrize(
@@ -432,3 +451,118 @@ def test_a_description_of_version_2_lacks_none_of_its_keys(saved: Path, key: str
     values = json.loads(path.read_text())
     path.write_text(json.dumps({k: v for k, v in values.items() if k != key}))
     assert f"'{key}' holds nothing" in refusal(saved)
+
+
+class Answering:
+    """A session that answers what a test says."""
+
+    def __init__(self, *answer: float, shape: tuple[int, ...] = (3, 23, 33)) -> None:
+        self.heatmap = np.full(shape, 0.5, np.float32)
+        self.heatmap.flat[: len(answer)] = answer
+
+    def run(self, *_: object) -> list[NDArray[np.float32]]:
+        return [self.heatmap]
+
+
+@pytest.mark.parametrize(
+    ("session", "expected"),
+    [
+        (Answering(7.5), "qualities of 0.5 to 7.5"),
+        (Answering(1e38), "qualities of 0.5 to 1e"),
+        (Answering(-3), "qualities of -3 to 0.5"),
+        (Answering(math.nan), "NaN"),
+        (Answering(*[0.5] * 800, math.inf), "infinity"),
+        (
+            Answering(shape=(3, 60, 80)),
+            r"\(3, 60, 80\) numbers, expected 3 for every window in a frame of 640x480 px",
+        ),
+        (Answering(shape=(2, 23, 33)), "numbers, expected"),
+        (Answering(shape=(3,)), "numbers, expected"),
+    ],
+)
+def test_an_answer_that_is_no_heatmap_of_the_frame_is_refused_in_one_line(
+    saved: Path, session: Answering, expected: str, frame: NDArray[np.uint8]
+) -> None:
+    tuned = load_object(saved)
+    tuned._session = session
+    with pytest.raises(QsgmError, match=expected + ".*; tune the object again") as raised:
+        tuned.heatmap(frame)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("frame", [None, np.zeros((480, 640), np.uint8), np.zeros((9, 9, 3))])
+def test_what_is_no_frame_is_refused_and_the_object_is_not_blamed(
+    bundle: Bundle, frame: Any
+) -> None:
+    tuned = TunedObject(described(), bundle.network_with({}), 1)
+    for look in (tuned.locate, tuned.locate_all, tuned.locate_at_any_distance, tuned.heatmap):
+        with pytest.raises(QsgmError, match="the frame is") as raised:
+            look(frame)
+        assert "tune the object" not in str(raised.value)
+
+
+@pytest.mark.parametrize("again", [copy, deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_an_object_can_be_copied_and_pickled(
+    bundle: Bundle, frame: NDArray[np.uint8], again: Callable[[TunedObject], TunedObject]
+) -> None:
+    tuned = TunedObject(described(), bundle.network_with({}), 1)
+    found, heatmap = tuned.locate(frame)
+    found_again, heatmap_again = again(tuned).locate(frame)
+    assert found_again == found
+    np.testing.assert_array_equal(heatmap_again, heatmap)
+
+
+def test_an_object_whose_network_keeps_numbers_elsewhere_is_refused(
+    bundle: Bundle, tmp_path: Path
+) -> None:
+    graph = (bundle.folder / "trunk_float_3.onnx").read_bytes()
+    save_object(tmp_path / "mug", MUG, graph, {})
+    (tmp_path / "mug" / "weights.bin").write_bytes((bundle.folder / "weights.bin").read_bytes())
+    assert "keeps numbers in the file 'weights.bin'" in refusal(tmp_path / "mug")
+
+
+@pytest.mark.parametrize("name", ["../network.onnx", "/etc/hostname", "", ".", "a\nb", 3, None])
+def test_a_file_of_an_object_is_one_in_its_folder(
+    bundle: Bundle, tmp_path: Path, name: object
+) -> None:
+    save_object(tmp_path / "toy", described(), bundle.network_with({}), {})
+    path = tmp_path / "toy" / DESCRIPTION
+    values = json.loads(path.read_text())
+    values["views"][0]["file"] = name
+    path.write_text(json.dumps(values))
+    assert "no plain name" in refusal(tmp_path / "toy")
+
+
+def test_an_object_that_is_replaced_while_it_is_read_is_the_old_or_the_new(
+    bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, networks = tmp_path / "toy", [bundle.network_with({}), other_network(bundle)]
+    read, reads = tuned_module.read_file, 0
+
+    def replacing(path: Path, *arguments: Any) -> bytes:
+        nonlocal reads
+        data = read(path, *arguments)
+        reads += 1
+        if reads == moment:
+            save_object(folder, named("new"), networks[1], {})
+        return data
+
+    monkeypatch.setattr(tuned_module, "read_file", replacing)
+    for moment in range(1, 4):
+        save_object(folder, named("old"), networks[0], {})
+        reads = 0
+        tuned = load_object(folder)
+        assert reads >= moment
+        expected = networks[tuned.description.name == "new"]
+        assert tuned._remade_from[1] == expected
+
+
+def test_a_name_that_cannot_be_shown_is_loaded_as_one_that_can(saved: Path) -> None:
+    path = saved / DESCRIPTION
+    name = "mug\x1b[31m\n\udcff" + "x" * 10**6
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"name": name}))
+    loaded = load_object(saved).description.name
+    assert loaded.startswith("mug\\x1b[31m\\n\\udcff")
+    assert loaded.isprintable()
+    assert len(loaded) < 300
+    loaded.encode()

@@ -7,6 +7,8 @@ device that cannot be written down in a few lines of arithmetic; it runs once, w
 taught, and its result, the mask, is kept with the object.
 """
 
+import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -16,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.images import decoding
 
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 
 PATCH_PX = 160
 HALF_PATCH_PX = PATCH_PX // 2
+_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", PATCH_PX, PATCH_PX)
 # GrabCut works at half the resolution: as good there, in a quarter of the time.
 _SHRINK = 2
 _PROBABLE_RADIUS_PX = 50.0
@@ -96,10 +100,10 @@ def decode_patch(data: bytes, path: Path) -> tuple[NDArray[np.uint8], NDArray[np
     Raises:
         QsgmError: it is something else.
     """
-    try:
-        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        bgra = None
+    bgra = None
+    if data.startswith(_HEADER):  # nothing larger is unpacked
+        with decoding(), suppress(cv2.error):
+            bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     wanted = (PATCH_PX, PATCH_PX, 4)
     if bgra is None or bgra.shape != wanted or bgra.dtype != np.uint8 or not bgra[..., 3].any():
         raise QsgmError(

@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,27 +18,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.errors import QsgmError
-from qsgm.files import new_folder
+from qsgm.errors import QsgmError, as_text
+from qsgm.files import is_plain, new_folder, read_file, read_whole
 from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
 from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
-from qsgm.grasp.heatmap import Detection, Place, locate, refine
+from qsgm.grasp.heatmap import CELL_PX, Detection, Place, locate, refine
 from qsgm.grasp.judge import JUDGED, cell_center
 from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
 from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.others import Other
 from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
 from qsgm.grasp.shown import View
-from qsgm.manifest import NETWORK, read_description, require_keys
-from qsgm.runtime import open_session, running
+from qsgm.images import check_frame
+from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
+from qsgm.runtime import Value, check_interface, open_session, running
 
 FORMAT = "qsgm-object"
 VERSIONS = (1, 2)
 DESCRIPTION = "object.json"
 REPORT = "report.json"
 PATCH = "patch.png"
+MOST_BYTES = 16_000_000  # of the network, of a patch
+MOST_VIEWS = 100
 FOUND_FROM = 0.5
 # Without a decision the patch moves a detection only where it fits as well as that.
 STRONG_CORRELATION = 0.7
@@ -55,6 +57,8 @@ SURE_AT_OTHER_SIZES = 0.9
 _LARGEST_SIDE_PX = 2048
 # Two places of the network that are closer are of the same object.
 _APART_PX = 48.0
+_TAKES: dict[str, Value] = {"frame": ("tensor(uint8)", (None, None, 3))}
+_GIVES: dict[str, Value] = {"heatmap": ("tensor(float)", (3, None, None))}
 _COMMAND = "qsgm finetune -o DIR"
 _ADVICE = "tune the object again with `qsgm finetune`"
 _KEYS: dict[str, type] = {"name": str, "encoding": str, "offset_rad": float, "sha256": str}
@@ -77,21 +81,33 @@ class ObjectDescription:
 class TunedObject:
     """A tuned object, ready to be looked for."""
 
-    def __init__(self, description: ObjectDescription, network: Path | bytes, threads: int) -> None:
+    def __init__(self, description: ObjectDescription, network: bytes, threads: int) -> None:
         self.description = description
-        self._session = open_session(network, threads)
-        inputs = [value.name for value in self._session.get_inputs()]
-        outputs = [value.name for value in self._session.get_outputs()]
-        if (inputs, outputs) != (["frame"], ["heatmap"]):
-            raise QsgmError(
-                f"the network of {description.name!r} takes {inputs} and gives {outputs}, expected "
-                f"a frame and its heatmap; {_ADVICE}"
-            )
+        self._remade_from = description, network, threads
+        name = f"the network of {description.name!r}"
+        self._session = open_session(network, threads, name=name)
+        check_interface(self._session, name, _TAKES, _GIVES, _ADVICE)
+
+    def __reduce__(self) -> tuple[type, tuple[ObjectDescription, bytes, int]]:
+        """Pickled without its session, which is opened anew."""
+        return type(self), self._remade_from
 
     def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
         """A frame (H, W, 3) at the object's scale to quality, sine and cosine (3, rows, cols)."""
-        with running(f"the object {self.description.name!r}", _ADVICE):
+        frame, name = check_frame(frame), self.description.name
+        with running(f"the object {name!r}", _ADVICE):
             heatmap: NDArray[np.float32] = self._session.run(["heatmap"], {"frame": frame})[0]
+        if not _is_of(heatmap, frame):
+            raise QsgmError(
+                f"the object {name!r} answers {heatmap.shape} numbers, expected 3 for every window "
+                f"in a frame of {frame.shape[1]}x{frame.shape[0]} px; {_ADVICE}"
+            )
+        low, high = float(heatmap[0].min()), float(heatmap[0].max())
+        if not (0 <= low <= high <= 1 and np.isfinite(heatmap).all()):
+            raise QsgmError(
+                f"the object {name!r} answers with qualities of {low:.3g} to {high:.3g}, NaN or "
+                f"infinity, expected finite numbers, qualities of 0 to 1; {_ADVICE}"
+            )
         return heatmap
 
     def locate(self, frame: NDArray[np.uint8]) -> tuple[Detection, NDArray[np.float32]]:
@@ -124,7 +140,8 @@ class TunedObject:
             scale = self.description.scale / size
             sides = scaled_shape(frame.shape[:2], scale)
             if min(sides) >= self._least_side_px and max(sides) <= _LARGEST_SIDE_PX:
-                other = copy(self)
+                other = object.__new__(type(self))  # not a copy: it shares the session
+                vars(other).update(vars(self))
                 other.description = replace(self.description, scale=scale)
                 yield other
 
@@ -173,6 +190,7 @@ class TunedObject:
         Raises:
             QsgmError: too little is left of it.
         """
+        frame = check_frame(frame)
         scaled, margin = scaled_frame(frame, self.description.scale), self._margin_px
         least = self._least_side_px
         if min(scaled.shape[:2]) < least:
@@ -283,21 +301,40 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     Raises:
         QsgmError: it is missing, altered, or something else.
     """
-    manifest = read_description(folder / DESCRIPTION, FORMAT, VERSIONS, _COMMAND)
+    return read_whole(folder, lambda: _load_object(folder, threads))
+
+
+def _load_object(folder: Path, threads: int) -> TunedObject:
+    path = folder / DESCRIPTION
+    data = read_file(path, MANIFEST_BYTES, f"an object written by `{_COMMAND}`")
+    manifest = parse_description(data, path, FORMAT, VERSIONS, _COMMAND)
     first = manifest["version"] == VERSIONS[0]
-    require_keys(folder / DESCRIPTION, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
-    description = ObjectDescription(manifest["name"], manifest["encoding"], manifest["offset_rad"])
-    if description.encoding not in ENCODINGS or not math.isfinite(description.offset_rad):
+    require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
+    name, encoding, offset_rad = (manifest[key] for key in ("name", "encoding", "offset_rad"))
+    if encoding not in ENCODINGS or not math.isfinite(offset_rad):
         raise QsgmError(
-            f"{folder / DESCRIPTION}: expected encoding {' or '.join(ENCODINGS)} and a finite "
-            f"offset_rad, got {description.encoding!r} and {description.offset_rad}; {_ADVICE}"
+            f"{path}: expected encoding {' or '.join(ENCODINGS)} and a finite "
+            f"offset_rad, got {encoding!r} and {offset_rad}; {_ADVICE}"
         )
-    path = folder / NETWORK
-    if not path.is_file() or _sha256(path.read_bytes()) != manifest["sha256"]:
-        raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    network = _unaltered(folder, NETWORK, manifest["sha256"])
+    description = ObjectDescription(as_text(name), encoding, offset_rad)
     if not first:
         description = _with_looks(description, folder, manifest)
-    return TunedObject(description, path, threads)
+    return TunedObject(description, network, threads)
+
+
+def _unaltered(folder: Path, name: object, sha256: object) -> bytes:
+    """A file of an object, if it is the one that the description means.
+
+    Raises:
+        QsgmError: it is missing, altered or elsewhere.
+    """
+    if not is_plain(name):
+        raise QsgmError(f"{folder / DESCRIPTION} names the file {name!r}, no plain name; {_ADVICE}")
+    data = read_file(folder / name, MOST_BYTES, f"a file that `{_COMMAND}` wrote")
+    if _sha256(data) != sha256:
+        raise QsgmError(f"{folder / name} is altered: its sha256 differs; {_ADVICE}")
+    return data
 
 
 def _to_json(about: ObjectDescription, patches: Mapping[str, bytes]) -> dict[str, Any]:
@@ -338,9 +375,13 @@ def _with_looks(
     path = folder / DESCRIPTION
     decision = manifest.get("decision")
     try:
-        views = tuple(_view(folder, one) for one in manifest["views"])
+        views = tuple(_view(folder, one) for one in manifest["views"][: MOST_VIEWS + 1])
         scale = float(manifest["scale"])
-        sane = 0 < scale <= MOST_ENLARGED and all(math.isfinite(one.turn_rad) for one in views)
+        sane = (
+            len(views) <= MOST_VIEWS
+            and 0 < scale <= MOST_ENLARGED
+            and all(math.isfinite(one.turn_rad) for one in views)
+        )
     except (KeyError, TypeError, ValueError, AttributeError):
         sane = False
     if not sane:
@@ -355,15 +396,21 @@ def _with_looks(
 
 
 def _view(folder: Path, entry: Mapping[str, Any]) -> View:
-    path = folder / str(entry["file"])
-    if path.parent != folder or not path.is_file() or _sha256(path.read_bytes()) != entry["sha256"]:
-        raise QsgmError(f"{path} is missing or altered; {_ADVICE}")
+    data = _unaltered(folder, entry["file"], entry["sha256"])
     x, y = (float(value) for value in entry["center_px"])
     if not (0 <= x <= PATCH_PX and 0 <= y <= PATCH_PX):
         raise ValueError(f"`center_px` must lie in the patch, got {(x, y)}")
-    image, mask = decode_patch(path.read_bytes(), path)
+    image, mask = decode_patch(data, folder / entry["file"])
     patch = Patch(image, mask, (x, y), bool(entry["cut_out"]))
     return View(patch, float(entry["turn_rad"]), bool(entry["whole"]))
+
+
+def _is_of(heatmap: NDArray[np.float32], frame: NDArray[np.uint8]) -> bool:
+    """Whether a heatmap has a frame's windows: those in it, and perhaps those just over its end."""
+    if heatmap.ndim != 3 or heatmap.shape[0] != 3:
+        return False
+    inside = (1 + (side - CROP_PX) // CELL_PX for side in frame.shape[:2])
+    return all(n in (few, few + 1) for n, few in zip(heatmap.shape[1:], inside, strict=True))
 
 
 def _as_detection(sighting: Sighting) -> Detection:
