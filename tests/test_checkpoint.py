@@ -2,7 +2,10 @@
 
 import os
 import pickle
+import re
 import zipfile
+from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +137,7 @@ def test_hidden_widths_are_checked_before_anything_of_that_width_is_made(
     data = torch.load(path, weights_only=True)
     torch.save(data | {"hidden": {4: widths, 5: widths}}, path)
     monkeypatch.setattr(module, "Sgm", lambda *_: pytest.fail("an SGM was made"))
-    assert "hidden width" in refuse(path)
+    assert re.search("hidden width|not a readable checkpoint", refuse(path))
 
 
 @pytest.mark.parametrize(
@@ -206,19 +209,50 @@ def test_the_number_of_layers_that_can_be_tuned_is_that_of_the_sgms_and_the_last
     assert Checkpoint(checkpoint.net, {}, {}, GraspTask(), {"6": (0.1,)}, {}).most_layers == 1
 
 
-def test_a_small_file_that_unpacks_to_a_large_one_is_refused_unread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "sgm.pt"
+def packed(path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("sgm/data.pkl", bytes(module.LARGEST_BYTES + 1))
-    assert path.stat().st_size < 2**20
+        archive.writestr("sgm/data/0", bytes(2**20))
+
+
+def nested(path: Path) -> None:
+    """Lists in lists in 2 MB, 60 times as much in memory."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("sgm/data.pkl", b"\x80\x02]" + b"]a" * 2**20 + b".")
+
+
+def overlapping(path: Path) -> None:
+    """Two thousand names for one MB."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("sgm/data/0", bytes(2**20))
+        for number in range(1, 2000):
+            entry = copy(archive.filelist[0])
+            entry.filename = f"sgm/data/{number}"
+            archive.filelist.append(entry)
+
+
+def large(path: Path) -> None:
+    with path.open("wb") as sparse:
+        sparse.truncate(module.LARGEST_BYTES + 1)
+
+
+@pytest.mark.parametrize("make", [packed, nested, overlapping, large])
+def test_a_file_that_would_fill_the_memory_is_refused_unread(
+    tmp_path: Path, make: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path / "sgm.pt")
     monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("it was read"))
-    assert "has 64 MB" in refuse(path)
+    assert re.search("not a readable checkpoint|has 67.* MB", refuse(tmp_path / "sgm.pt"))
+
+
+def test_the_shipped_checkpoint_is_far_from_every_limit() -> None:
+    with zipfile.ZipFile(Path(__file__).parents[1] / "sgm.pt") as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+    assert 10 * sum(sizes.values()) < module.LARGEST_BYTES
+    assert 10 * max(v for k, v in sizes.items() if "pkl" in k) < module.LARGEST_PICKLE_BYTES
 
 
 def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
-    assert "not a readable checkpoint" in refuse(tmp_path / ("x" * 5000))
+    assert "cannot read" in refuse(tmp_path / ("x" * 5000))
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OverflowError("too large"), RecursionError()])

@@ -1,7 +1,10 @@
 """Pretraining as a whole, in a size that takes seconds."""
 
+import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -160,6 +163,32 @@ def test_a_damaged_partial_counts_as_none(tmp_path: Path, spoil: Callable[[bytes
     assert "backbone" not in stages_until_meta(tmp_path / "sgm.pt")
     path.write_bytes(spoil(path.read_bytes()))
     assert "backbone" in stages_until_meta(tmp_path / "sgm.pt")
+
+
+@pytest.mark.parametrize(
+    "saved",
+    [
+        {},
+        [1],
+        {"identity": {"seed": 0}},
+        {"identity": {"seed": 0}, "data": {}},
+        {"identity": {"seed": 0}, "data": 3, "seconds": 1.0},
+        {"identity": {"seed": 0}, "data": {}, "seconds": "x"},
+        {"identity": {"seed": 0}, "data": {"net": 1}, "seconds": math.nan},
+        {"identity": {"seed": torch.zeros(2)}, "data": {"net": 1}, "seconds": 1.0},
+    ],
+    ids=str,
+)
+def test_a_partial_with_a_right_digest_and_wrong_content_counts_as_none(
+    tmp_path: Path, saved: object
+) -> None:
+    buffer = BytesIO()
+    torch.save(saved, buffer)
+    body = buffer.getvalue()
+    (tmp_path / "x.partial").write_bytes(hashlib.sha256(body).digest() + body)
+    taken_up = Partial.open(tmp_path / "x", {"seed": 0})
+    assert not taken_up.resumed
+    assert taken_up.seconds < 1
 
 
 def test_a_folder_in_the_partials_place_is_said_in_one_line(tmp_path: Path) -> None:

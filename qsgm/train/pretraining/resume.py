@@ -6,14 +6,16 @@ and an unfinished pretraining that is damaged counts as none.
 
 import hashlib
 from io import BytesIO
+from math import isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
 
-from qsgm.files import write_bytes_atomic
+from qsgm.files import read_file, write_bytes_atomic
 
+LARGEST_BYTES = 2**30
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
@@ -31,10 +33,7 @@ class Partial:
     def open(output: Path, identity: dict[str, Any]) -> "Partial":
         """Take up `<output>.partial` if whole and of the same identity, else start from nothing."""
         path = output.with_name(output.name + ".partial")
-        saved = _read(path)
-        if saved.get("identity") != identity:
-            return Partial(path, identity, {})
-        return Partial(path, identity, saved["data"], saved["seconds"])
+        return Partial(path, identity, *_read(path, identity))
 
     @property
     def seconds(self) -> float:
@@ -56,13 +55,15 @@ class Partial:
         self.path.unlink(missing_ok=True)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """What :meth:`Partial.save` wrote; empty if there is nothing, or not exactly that."""
+def _read(path: Path, identity: dict[str, Any]) -> tuple[dict[str, Any], float]:
+    """Data and seconds that :meth:`Partial.save` wrote; none if it is not exactly that."""
     try:
-        content = path.read_bytes()
+        content = read_file(path, LARGEST_BYTES, "an unfinished pretraining")
         digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        if hashlib.sha256(body).digest() != digest:
-            return {}
-        return dict(torch.load(BytesIO(body), map_location="cpu", weights_only=True))
+        if hashlib.sha256(body).digest() == digest:
+            saved = torch.load(BytesIO(body), map_location="cpu", weights_only=True)
+            if saved["identity"] == identity and isfinite(saved["seconds"]):
+                return dict(saved["data"]), float(saved["seconds"])
     except Exception:  # someone else's file, whatever is wrong with it
-        return {}
+        return {}, 0.0
+    return {}, 0.0
