@@ -1,12 +1,18 @@
 """Where things are when no flag says so: the shipped artifacts and the last tuned object."""
 
+import errno
+import hashlib
 import os
 import re
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
 from qsgm.errors import QsgmError
-from qsgm.files import write_text_atomic
+from qsgm.files import read_file, write_bytes_atomic
+
+_LONGEST_NAME = 60  # letters of four bytes at most, where systems allow 255 bytes
+_LONGEST_PATH = 10_000
 
 
 def bundle_folder(flag: Path | None = None) -> Path:
@@ -28,9 +34,22 @@ def calibration_folder(flag: Path | None = None) -> Path:
 
 
 def object_folder(frame: Path) -> Path:
-    """Where the object tuned on `frame` goes when ``-o`` is not given: named after the frame."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "_", frame.stem).strip("._") or "object"
-    return _data_folder() / "objects" / name
+    """Where the object tuned on `frame` goes when ``-o`` is not given: named after the frame.
+
+    Letters and digits of any script stay. Where the frame's name has anything else in it, a short
+    hash tells it from others that would come to the same.
+    """
+    name = name_of(frame)
+    kept = re.sub(r"[^\w.-]+", "_", name)[:_LONGEST_NAME].strip("._")
+    if kept != name:
+        digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+        kept = f"{kept}-{digest}" if kept else f"object-{digest}"
+    return _data_folder() / "objects" / kept
+
+
+def name_of(frame: Path) -> str:
+    """What an object is called after its frame."""
+    return "stdin" if frame == Path("-") else frame.stem
 
 
 def remember_object(folder: Path) -> None:
@@ -39,25 +58,28 @@ def remember_object(folder: Path) -> None:
     Raises:
         QsgmError: the user's data folder cannot be written.
     """
-    write_text_atomic(_last_object_file(), f"{folder.resolve()}\n")
+    write_bytes_atomic(_last_object_file(), os.fsencode(folder.resolve()) + b"\n")
 
 
 def last_object_folder() -> Path:
     """The object tuned last by this user, wherever it was written.
 
     Raises:
-        QsgmError: nothing was tuned here yet, or it is gone.
+        QsgmError: nothing was tuned here yet, or it is gone, or nobody may look.
     """
+    file = _last_object_file()
     try:
-        text = _last_object_file().read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError):
-        text = ""
+        there = file.exists()
+    except OSError:  # not allowed to look: reading says so
+        there = True
+    content = read_file(file, _LONGEST_PATH, "the name of the last object") if there else b""
+    text = os.fsdecode(content.removesuffix(b"\n"))
     if not text:
         raise QsgmError(
             "no object was tuned here yet: run `qsgm finetune object.png` first or pass --object"
         )
     folder = Path(text)
-    if not _is_folder(folder):
+    if not is_folder(folder):
         raise QsgmError(
             f"the object tuned last, {folder}, is gone: run `qsgm finetune` again or pass --object"
         )
@@ -67,12 +89,12 @@ def last_object_folder() -> Path:
 def _artifact(name: str, option: str, flag: Path | None) -> Path:
     """First of: the flag's folder, the installed copy, the folder in the checkout."""
     if flag is not None:
-        if not _is_folder(flag):
+        if not is_folder(flag):
             raise QsgmError(f"{option} {flag}: there is no such folder; check the name")
         return flag
     candidates = [_installed(name), _in_checkout(name)]
     for folder in candidates:
-        if folder is not None and _is_folder(folder):
+        if folder is not None and is_folder(folder):
             return folder
     raise QsgmError(
         f"this installation comes without {name}/ (neither beside the code nor in a checkout); "
@@ -91,11 +113,21 @@ def _in_checkout(name: str) -> Path | None:
     return top / name if (top / "pyproject.toml").is_file() else None
 
 
-def _is_folder(path: Path) -> bool:
+def is_folder(path: Path) -> bool:
+    """Whether a path names a folder.
+
+    Raises:
+        QsgmError: nobody may look.
+    """
     try:
         return path.is_dir()
-    except OSError:  # not allowed to look, name too long
-        return False
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return False
+        raise QsgmError(
+            f"cannot look into {path}: {str(error.strerror).lower()}; pass a folder that can"
+            " be read"
+        ) from error
 
 
 def _last_object_file() -> Path:
@@ -107,10 +139,10 @@ def _data_folder() -> Path:
     base = os.environ.get("XDG_DATA_HOME", "")
     if base and Path(base).is_absolute():  # the specification says to ignore relative ones
         return Path(base) / "qsgm"
-    try:
-        return Path.home() / ".local" / "share" / "qsgm"
-    except RuntimeError as error:
-        raise QsgmError(
-            "this user has no home folder to keep tuned objects in; pass -o or --object, "
-            "or set XDG_DATA_HOME"
-        ) from error
+    with suppress(RuntimeError):
+        if Path(os.environ.get("HOME", "/")).is_absolute():  # '' would be the root
+            return Path.home() / ".local" / "share" / "qsgm"
+    raise QsgmError(
+        "this user has no home folder to keep tuned objects in; pass -o or --object, "
+        "or set XDG_DATA_HOME"
+    )

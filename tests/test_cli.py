@@ -1,6 +1,7 @@
 """The command line: stable keys, one line for every error, and nothing half-written."""
 
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import pytest
 from toys import by_correlation, lay, table, toy
 
 from qsgm import __version__, cli, paths
-from qsgm.cli import commands, console
+from qsgm.cli import app, commands, console
 from qsgm.errors import QsgmError
 from qsgm.manifest import NETWORK, trunk_file
 from qsgm.tune import run as finetuning
@@ -522,7 +523,7 @@ def test_a_spoilt_bundle_is_refused_in_one_line(
     (own_bundle / trunk_file("float", 3)).write_bytes(b"altered")
     assert_refused(qsgm(*command), 1, "trunk_float_3.onnx", "qsgm fold-and-quantize")
     (own_bundle / trunk_file("float", 3)).unlink()
-    assert_refused(qsgm(*command), 1, "lacks trunk_float_3.onnx")
+    assert_refused(qsgm(*command), 1, "trunk_float_3.onnx does not exist")
     (own_bundle / "manifest.json").unlink()
     assert_refused(qsgm(*command), 1, "manifest.json")
     missing = ("finetune", "--bundle", tmp_path / "nowhere", frame_path)
@@ -640,6 +641,24 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def environment(**changes: str | None) -> dict[str, str]:
+    values = {**os.environ, **changes}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def predict_into(taught: Path, frame: Path, redirection: str, **changes: str | None) -> Outcome:
+    """`predict` in a shell, its streams as the shell's words have them."""
+    command = [sys.executable, "-m", "qsgm.cli", "predict", "--object", str(taught), str(frame)]
+    done = subprocess.run(
+        ["bash", "-c", f'"$@" {redirection}', "bash", *command],
+        env=environment(**changes),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
 def test_a_reader_that_goes_away_makes_no_noise(taught: Path, frame_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "qsgm.cli", "predict", "--object", str(taught), str(frame_path)],
@@ -649,9 +668,169 @@ def test_a_reader_that_goes_away_makes_no_noise(taught: Path, frame_path: Path) 
     assert process.stderr is not None
     process.stdout.close()
     err = process.stderr.read()
-    process.wait(timeout=30)
+    code = process.wait(timeout=30)
     process.stderr.close()
-    assert err == ""
+    assert (code, err) == (141, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize("options", ["", "--json", "--help"])
+def test_a_full_disk_behind_stdout_is_one_line(
+    taught: Path, frame_path: Path, options: str
+) -> None:
+    outcome = predict_into(taught, frame_path, f"{options} >/dev/full")
+    assert_refused(outcome, 1, "cannot write to standard output: no space left on device")
+
+
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_nobodys_and_no_files(
+    taught: Path, frame_path: Path, tmp_path: Path, streams: str
+) -> None:
+    outcome = predict_into(taught, frame_path, f"-o {tmp_path}/picture.png {streams}")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert cv2.imread(str(tmp_path / "picture.png")) is not None
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_a_table_is_printed_in_any_encoding(taught: Path, frame_path: Path, encoding: str) -> None:
+    outcome = predict_into(taught, frame_path, "", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "quality" in outcome.out
+
+
+@pytest.mark.parametrize("columns", ["0", "100000000000"])
+def test_a_table_is_printed_whatever_columns_says(
+    taught: Path, frame_path: Path, columns: str
+) -> None:
+    outcome = predict_into(taught, frame_path, "", COLUMNS=columns)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "quality" in outcome.out
+
+
+def test_a_picture_can_be_piped_in(taught: Path, frame_path: Path) -> None:
+    piped = predict_into(taught, Path("-"), f"--json <{frame_path}")
+    assert piped.json == predict_into(taught, frame_path, "--json").json
+    assert_refused(predict_into(taught, Path("-"), "</dev/null"), 1, "- is empty")
+    assert_refused(predict_into(taught, Path("-"), "<&-"), 1, "- does not exist")
+
+
+@pytest.mark.parametrize(
+    "options", [("-o", "scene.jpg"), ("-o", "scene"), ("-o", "../scenes/scene.png")]
+)
+def test_a_picture_that_must_not_be_written_is_refused_before_anything_runs(
+    qsgm: Run,
+    taught: Path,
+    frame_path: Path,
+    tmp_path: Path,
+    options: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "scenes").mkdir()
+    scene = tmp_path / "scenes" / "scene.png"
+    scene.write_bytes(frame_path.read_bytes())
+    monkeypatch.chdir(tmp_path / "scenes")
+    outcome = qsgm("predict", "--object", taught, *options, scene)
+    assert_refused(outcome, 1, "scene", "; pass another name" if "../" in options[1] else ".png")
+    assert scene.read_bytes() == frame_path.read_bytes()
+    assert [path.name for path in scene.parent.iterdir()] == ["scene.png"]
+
+
+def test_a_report_does_not_take_the_place_of_the_frame(
+    qsgm: Run, bundle_folder: Path, frame_path: Path
+) -> None:
+    before = frame_path.read_bytes()
+    outcome = qsgm("fidelity", "--bundle", bundle_folder, "-o", frame_path, frame_path)
+    assert_refused(outcome, 1, "it is an input")
+    assert frame_path.read_bytes() == before
+
+
+@pytest.mark.parametrize("output", [".", "", "../here", "/"])
+def test_the_working_folder_is_never_replaced(
+    qsgm: Run,
+    bundle_folder: Path,
+    frame_path: Path,
+    tmp_path: Path,
+    output: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    outcome = qsgm("finetune", "--bundle", bundle_folder, "-o", output, frame_path)
+    assert_refused(outcome, 1, "will not replace the folder")
+    assert list(tmp_path.glob("*")) == [tmp_path / "here"]
+
+
+NAMES = [
+    "mug\udcff",
+    "mug\x1b[31m",
+    "mug\nmug",
+    "[red]mug[]",
+    "日本語",
+    "m" * 240,
+    " mug ",
+    "\u202egum",
+]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+def test_any_name_is_taught_found_and_drawn_as_text(
+    qsgm: Run, bundle_folder: Path, frame_path: Path, tmp_path: Path, name: str
+) -> None:
+    frame = tmp_path / f"{name}.png"
+    frame.write_bytes(frame_path.read_bytes())
+    options = ("-o", tmp_path / f"{name}-out") if name in NAMES[::2] else ()
+    taught = qsgm("finetune", "--epochs", 0, "--bundle", bundle_folder, *options, frame)
+    assert taught.code == 0, taught.err
+    found = qsgm("predict", "-o", tmp_path / f"{name}2.png", frame)
+    assert found.code == 0, found.err
+    for text in (taught, found):
+        assert text.err == ""
+        assert all(line.isprintable() for line in text.out.splitlines())
+
+
+def test_an_interrupt_that_became_another_error_while_modules_loaded_is_an_interrupt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(_: object) -> int:
+        raise ImportError("numpy.core.multiarray failed to import")
+
+    monkeypatch.setattr(app, "call", broken)
+    for signals, code in (((2,), 130), ((15,), 143), ((1,), 129)):
+        assert cli.run(["predict"], signals) == code
+        assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libGL.so.1: cannot open shared object file", name="cv2"),
+        ImportError("libGL.so.1: cannot open shared object file"),
+        ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime"),
+        AttributeError("module 'cv2' has no attribute 'imdecode'", obj=cv2),
+    ],
+)
+def test_a_broken_installation_is_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, qsgm: Run
+) -> None:
+    def broken(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(app, "call", broken)
+    assert_refused(qsgm("predict"), 1, "the installation of", "is broken", str(error))
+
+
+@pytest.mark.parametrize(
+    "error", [ImportError("no", name="qsgm.nothing"), AttributeError("no", obj=None)]
+)
+def test_a_module_of_our_own_that_is_missing_is_a_bug(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(app, "call", broken)
+    with pytest.raises(type(error)):
+        cli.run(["predict"])
 
 
 def test_an_object_that_cannot_be_remembered_is_still_written(

@@ -1,10 +1,11 @@
 """Look-up: the flag first, then the installed copy, then the checkout."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from qsgm import paths
+from qsgm import files, paths
 from qsgm.errors import QsgmError
 
 
@@ -66,13 +67,75 @@ def test_a_flag_that_names_no_folder_is_refused(tmp_path: Path, name: str) -> No
     ("frame", "name"),
     [
         ("photos/mug.png", "mug"),
-        ("my mug (2).jpg", "my_mug_2"),
-        ("..png", "object"),
-        ("???", "object"),
+        ("日本語.png", "日本語"),
+        ("Tasse_ä-1.png", "Tasse_ä-1"),
+        ("my mug (2).jpg", "my_mug_2-3448c49d"),
+        ("???", "object-a03b221c"),
     ],
 )
 def test_an_object_is_named_after_its_frame(data_home: Path, frame: str, name: str) -> None:
     assert paths.object_folder(Path(frame)) == data_home / "qsgm" / "objects" / name
+
+
+def test_different_names_never_come_to_the_same_folder() -> None:
+    names = [
+        "茶碗",
+        "日本語",
+        "a b",
+        "a_b",
+        "a  b",
+        "a(b",
+        "!",
+        "?",
+        ".a",
+        "a.",
+        "-",
+        "\udcff",
+        "\udcfe",
+    ]
+    names += ["x" * 60, "x" * 61, "x" * 62, "क", "का", "कि"]
+    folders = {paths.object_folder(Path(f"{name}.png")) for name in names}
+    assert len(folders) == len(names)
+    assert all(len(os.fsencode(folder.name)) <= 255 for folder in folders)
+
+
+def test_a_name_that_is_not_utf_8_or_ends_in_a_blank_is_remembered(tmp_path: Path) -> None:
+    for name in ("mug \n", "mug\udcff", " mug "):
+        folder = make(tmp_path / name)
+        paths.remember_object(folder)
+        assert paths.last_object_folder() == folder
+
+
+@pytest.mark.parametrize("home", ["", "relative"])
+def test_an_empty_home_is_none(monkeypatch: pytest.MonkeyPatch, home: str) -> None:
+    monkeypatch.delenv("XDG_DATA_HOME")
+    monkeypatch.setenv("HOME", home)
+    with pytest.raises(QsgmError, match="no home folder"):
+        paths.object_folder(Path("mug.png"))
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), OSError(5, "I/O")])
+def test_a_data_folder_that_cannot_be_read_is_not_called_empty(
+    monkeypatch: pytest.MonkeyPatch, error: OSError
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    paths.remember_object(Path())
+    monkeypatch.setattr(files.os, "open", fail)
+    with pytest.raises(QsgmError, match=r"cannot read .*last: "):
+        paths.last_object_folder()
+
+
+def test_a_folder_that_nobody_may_look_into_is_not_called_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(_: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "is_dir", fail)
+    with pytest.raises(QsgmError, match=r"cannot look into .*: permission denied"):
+        paths.bundle_folder(tmp_path)
 
 
 def test_the_last_object_is_remembered_wherever_it_is(

@@ -9,12 +9,13 @@ import typer
 
 from qsgm import defaults, paths
 from qsgm.cli.console import (
-    complain,
+    check_output,
     host_module,
     open_bundle,
     print_json,
     progress,
     show,
+    tell,
     write_report,
 )
 from qsgm.cli.options import (
@@ -50,7 +51,8 @@ from qsgm.cli.options import (
     settings_of,
     tuned_layers,
 )
-from qsgm.errors import QsgmError
+from qsgm.cli.streams import complain
+from qsgm.errors import QsgmError, as_text
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
@@ -88,7 +90,7 @@ def pretrain(
     if as_json:
         print_json({"output": str(output), "seed": seed, "device": device.value})
     else:
-        typer.echo(f"pretrained: {output}")
+        tell("pretrained", output)
 
 
 @app.command("draw-calibration")
@@ -107,7 +109,7 @@ def draw_calibration(
     if as_json:
         print_json({"output": str(output), "frames": count, "seed": seed})
     else:
-        typer.echo(f"calibration set: {output}")
+        tell("calibration set", output)
 
 
 @app.command("fold-and-quantize")
@@ -205,13 +207,13 @@ def finetune(
     folder = paths.object_folder(first) if output is None else output
     check_replaceable(folder, DESCRIPTION)
     result = _finetune(frames, centers, others or (), open_bundle(bundle), settings, span)
-    name = folder.name if output is None else first.stem
+    name = as_text(paths.name_of(first))
     report = finetune_json(result, name, folder)
     result.save(folder, name)
     _remember(folder, chosen=output is not None)
     show(report, finetune_report(result, name), as_json)
     if not as_json:
-        typer.echo(f"tuned object: {folder}")
+        tell("tuned object", folder)
 
 
 @app.command()
@@ -240,10 +242,13 @@ def predict(
     from qsgm.grasp.pictures import draw_detection
     from qsgm.grasp.report import detection_table, instances_table, predict_json
     from qsgm.grasp.tuned import load_object
-    from qsgm.images import read_frame, write_png
+    from qsgm.images import check_png_name, read_frame, write_png
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
+    if output is not None:
+        check_png_name(output)
+        check_output(output, scene)
     found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
     frame = read_frame(scene)
     look = found.locate_at_any_distance if any_distance else found.locate
@@ -259,7 +264,7 @@ def predict(
     )
     show(report, table, as_json)
     if output is not None and not as_json:
-        typer.echo(f"picture: {output}")
+        tell("picture", output)
 
 
 @app.command()
@@ -297,13 +302,15 @@ def fidelity(
         int8, MethodName.SGM, layers, optimizer, epochs, seed, threads, trunk=trunk
     )
     settings = replace(settings, probe_every=every)
+    for path in (output, picture):
+        check_output(path, frame)
     result = _finetune([frame], [parsed_center(center)], (), open_bundle(bundle), settings)
     if not result.probes:
         raise QsgmError(
             f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
             "there is nothing to compare; export it again with `qsgm fold-and-quantize`"
         )
-    report = fidelity_command_json(result, frame.stem)
+    report = fidelity_command_json(result, as_text(paths.name_of(frame)))
     if picture is not None:
         from qsgm.bench.charts import fidelity_over_run, write_chart
 
@@ -311,7 +318,7 @@ def fidelity(
     write_report(report, output)
     show(report, fidelity_command_report(result), as_json)
     if picture is not None and not as_json:
-        typer.echo(f"picture: {picture}")
+        tell("picture", picture)
 
 
 def _finetune(
@@ -344,7 +351,11 @@ def _other(path: Path) -> "Other":
     from qsgm.grasp.others import other_in
     from qsgm.grasp.tuned import load_object
 
-    return load_object(path).as_other() if path.is_dir() else other_in(_demonstration(path, None))
+    return (
+        load_object(path).as_other()
+        if paths.is_folder(path)
+        else other_in(_demonstration(path, None))
+    )
 
 
 def _remember(folder: Path, *, chosen: bool) -> None:

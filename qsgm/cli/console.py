@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,20 +18,40 @@ from rich.progress import (
 )
 
 from qsgm import paths
-from qsgm.errors import QsgmError
+from qsgm.errors import QsgmError, as_text
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
 
 # library: the extra that brings it
 HOST_LIBRARIES = {"torch": "train", "onnx": "train", "matplotlib": "report"}
+LEAST_COLUMNS, MOST_COLUMNS = 40, 1000
 # (stage, done, of how many, values to show)
 Watch = Callable[..., None]
 
 
-def complain(message: str) -> None:
-    """One line on stderr, whatever a file's name may hold."""
-    typer.echo(" ".join(message.splitlines()), err=True)
+def tell(what: str, path: Path) -> None:
+    """Where something has been written."""
+    typer.echo(f"{what}: {as_text(str(path), 5000)}")
+
+
+def terminal(*, stderr: bool = False) -> Console:
+    """A stream to draw on, of a width that something fits into: COLUMNS may say anything."""
+    console = Console(stderr=stderr)
+    console.width = min(max(console.width, LEAST_COLUMNS), MOST_COLUMNS)
+    return console
+
+
+def check_output(output: Path | None, *inputs: Path) -> None:
+    """Refuse to write over what a command reads.
+
+    Raises:
+        QsgmError: `output` is one of the inputs, however it is spelt.
+    """
+    for path in inputs:
+        with suppress(OSError, ValueError):
+            if output is not None and output.samefile(path):
+                raise QsgmError(f"will not write over {output}: it is an input; pass another name")
 
 
 def show(values: dict[str, Any], table: RenderableType, as_json: bool) -> None:
@@ -39,7 +59,7 @@ def show(values: dict[str, Any], table: RenderableType, as_json: bool) -> None:
     if as_json:
         print_json(values)
     else:
-        Console().print(table)
+        terminal().print(table)
 
 
 def print_json(values: dict[str, Any]) -> None:
@@ -82,7 +102,7 @@ def host_module(name: str) -> Any:
 @contextmanager
 def progress() -> Iterator[Watch]:
     """A bar per stage on stderr, on a terminal only; yields what is told about progress."""
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     columns = (
         TextColumn("{task.description:>10}"),
         BarColumn(),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qsgm import defaults
-from qsgm.cli.console import complain
+from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError
 
 if TYPE_CHECKING:
@@ -105,7 +105,9 @@ CentersOption = Annotated[
         help="Object's centre in px, once or for every frame; default: the frames' centres.",
     ),
 ]
-SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at.")]
+SceneArgument = Annotated[
+    Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at; - is what is piped in.")
+]
 BundleOption = Annotated[
     Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
 ]

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.errors import as_text
 from qsgm.grasp.angles import round_degrees
 from qsgm.grasp.crops import HALF_CROP_PX
 from qsgm.grasp.heatmap import CELL_PX, Detection
@@ -231,7 +232,13 @@ def _caption(canvas: _Canvas, detection: Detection, title: str, found: int) -> P
     verdict_width = _text_width(verdict, unit * 0.85, bold=True)
     _text(panel, verdict, (width - 36 * unit - verdict_width, 44 * unit), unit * 0.85, accent, True)
     room = width - 110 * unit - verdict_width
-    _text(panel, _shortened(title, room, unit * 0.85), (36 * unit, 44 * unit), unit * 0.85, _VALUE)
+    _text(
+        panel,
+        _shortened(as_text(title), room, unit * 0.85),
+        (36 * unit, 44 * unit),
+        unit * 0.85,
+        _VALUE,
+    )
     for column, (label, value) in enumerate(_values(detection)):
         x = (36 + 310 * column) * unit
         _text(panel, label, (x, 86 * unit), unit * 0.6, _LABEL)
