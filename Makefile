@@ -11,11 +11,13 @@ PIP := -m pip install --disable-pip-version-check --quiet
 # Whatever ends up in the wheel: a change here installs again, nothing else does.
 PACKAGED := pyproject.toml README.md $(shell find qsgm calib export -type f -not -name '*.pyc')
 
-.PHONY: help demo test lint format clean
+TIMES ?= 50
+
+.PHONY: help demo test robustness lint format clean
 .DEFAULT_GOAL := help
 
 help:  ## show these lines
-	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: .venv/installed  ## fine-tune on one frame in int8, find the object in another
 	mkdir -p $(DEMO_OUT)
@@ -26,6 +28,9 @@ demo: .venv/installed  ## fine-tune on one frame in int8, find the object in ano
 test: lint  ## lint, types and tests
 	.venv-test/bin/mypy
 	.venv-test/bin/python -m pytest
+
+robustness: .venv-test/installed  ## fuzz, kill and starve it for long; counts at the end
+	QSGM_ROBUSTNESS=$(TIMES) .venv-test/bin/python -m pytest tests/robustness
 
 lint: .venv-test/installed  ## check style and formatting
 	.venv-test/bin/ruff check .

@@ -319,13 +319,15 @@ def _exchange(one: Path, other: Path) -> bool:
 def _replace_in_two_steps(new: Path, final: Path) -> None:
     """Between the steps there is nothing under the name; whatever happens, the old comes back."""
     old = new.with_name(_OLD) / final.name
+    shutil.rmtree(old, ignore_errors=True)  # of a try before, in whose place there is another's now
     old.parent.mkdir(exist_ok=True)
     try:
         final.rename(old)
         new.rename(final)
     finally:
-        if old.exists() and not final.exists():
-            old.rename(final)
+        with suppress(OSError):
+            if old.exists() and not final.exists():
+                old.rename(final)
 
 
 def _make_folder(path: Path) -> None:

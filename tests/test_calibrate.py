@@ -400,7 +400,7 @@ def test_the_demo_object_turns_and_moves_as_its_truth_says() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "no calibration set, it has no manifest.json"),
+        (None, "manifest.json does not exist: expected a calibration set"),
         ("[]", "is damaged"),
         ("{", "is damaged"),
         ('{"frames": [{"file": "a"}]}', "is damaged"),

@@ -2,16 +2,22 @@
 
 import hashlib
 import os
+import re
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from qsgm import files
-from qsgm.errors import QsgmError
+from qsgm.errors import QsgmError, as_text
 from qsgm.files import (
     LISTING,
+    check_replaceable,
+    is_plain,
     new_folder,
+    read_file,
+    read_whole,
     write_bytes_atomic,
     write_text_atomic,
 )
@@ -261,3 +267,131 @@ def test_a_foreign_folder_is_refused_without_looking_further_than_needed(
     assert "'thesis.txt'" in refusal(tmp_path)
     assert looked_into
     assert set(looked_into) == {tmp_path}
+
+
+def refused_read(path: Path, most: int = 100) -> str:
+    with pytest.raises(QsgmError, match="expected a note") as raised:
+        read_file(path, most, "a note")
+    assert str(raised.value).isprintable()
+    return str(raised.value)
+
+
+def test_only_a_regular_file_within_its_budget_is_read(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"x" * 100)
+    assert read_file(tmp_path / "file", 100, "a note") == b"x" * 100
+    assert read_file(tmp_path / "file", 1000, "a note") == b"x" * 100
+    assert "has 0.0001 MB" in refused_read(tmp_path / "file", 99)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")  # opening it would wait for a writer
+    (tmp_path / "one").symlink_to("two")
+    (tmp_path / "two").symlink_to("one")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(os.path.relpath(tmp_path / "socket"))
+    expected = {
+        "pipe": "is not a regular file",
+        "": "is a folder",
+        "none": "does not exist",
+        "one": "too many levels of symbolic links",
+        "n" * 300: "file name too long",
+        "file/below": "not a directory",
+        "null\0byte": "null byte",
+        "socket": "cannot read",
+    }
+    (tmp_path / "file").touch()
+    for name, reason in expected.items():
+        assert reason in refused_read(tmp_path / name)
+    for device in ("/dev/zero", "/dev/null", "/dev/tty", "/dev/full"):
+        if Path(device).exists():
+            assert re.search("is not a regular file|cannot read", refused_read(Path(device)))
+
+
+def test_a_file_that_says_it_has_no_size_is_read_to_its_end_or_its_budget() -> None:
+    if not Path("/proc/self/status").exists():
+        pytest.skip("there is no /proc")
+    assert b"VmHWM" in read_file(Path("/proc/self/status"), 100_000, "a note")
+    assert "expected a note of at most" in refused_read(Path("/proc/self/status"), 10)
+
+
+def test_a_file_nobody_may_read_or_memory_is_too_small_for_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for error, reason in (
+        (PermissionError(13, "Permission denied"), "permission denied"),
+        (OSError(5, "Input/output error"), "input/output error"),
+        (MemoryError(), "memoryerror"),
+    ):
+
+        def fail(*_: object, error: BaseException = error) -> int:
+            raise error
+
+        monkeypatch.setattr(os, "open", fail)
+        assert reason in refused_read(tmp_path / "file")
+
+
+def test_links_in_a_circle_are_refused_as_a_place_to_write_to(tmp_path: Path) -> None:
+    (tmp_path / "one").symlink_to("two")
+    (tmp_path / "two").symlink_to("one")
+    for path in (tmp_path / "one", tmp_path / "one" / "below", tmp_path / "null\0byte"):
+        with pytest.raises(QsgmError, match="cannot write"):
+            write_bytes_atomic(path, b"x")
+        with pytest.raises(QsgmError, match="cannot write"):
+            check_replaceable(path, MARKER)
+
+
+def test_a_name_as_long_as_the_system_allows_can_be_written(tmp_path: Path) -> None:
+    write_bytes_atomic(tmp_path / ("f" * 255), b"x")
+    write_object(tmp_path / ("d" * 255))
+    write_object(tmp_path / ("d" * 255), "again")
+    assert (tmp_path / ("d" * 255) / MARKER).read_text() == "again"
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "a/b", "a\\b", "", ".", "..", "a\nb", None, 3])
+def test_only_a_name_without_a_way_is_plain(name: object) -> None:
+    assert not is_plain(name)
+    assert is_plain("日本 語.png")
+
+
+def test_a_stale_workshop_is_swept_and_one_at_work_is_left_alone(tmp_path: Path) -> None:
+    stale = tmp_path / ".qsgm-0123456789abcdef"
+    (stale / "old" / "mug").mkdir(parents=True)
+    (stale / "old" / "mug" / MARKER).write_text("what was to be replaced")
+    (tmp_path / ".qsgm-mine").mkdir()
+    with new_folder(tmp_path / "cup", MARKER) as inside:
+        write_bytes_atomic(tmp_path / "file", b"x")
+        (inside / MARKER).write_text("{}")
+    assert names(tmp_path) == [".qsgm-mine", "cup", "file", "mug"]
+    assert (tmp_path / "mug" / MARKER).read_text() == "what was to be replaced"
+
+
+def test_a_folder_is_read_again_only_if_it_was_replaced(tmp_path: Path) -> None:
+    write_object(tmp_path / "mug", "old")
+    tried = 0
+
+    def load() -> str:
+        nonlocal tried
+        tried += 1
+        if tried == 1:
+            write_object(tmp_path / "mug", "new")
+            raise QsgmError("half of this, half of that")
+        return (tmp_path / "mug" / MARKER).read_text()
+
+    def damaged() -> str:
+        nonlocal tried
+        tried += 1
+        raise QsgmError("damaged")
+
+    assert read_whole(tmp_path / "mug", load) == "new"
+    tried = 0
+    with pytest.raises(QsgmError, match="damaged"):
+        read_whole(tmp_path / "mug", damaged)
+    assert tried == 1
+
+
+def test_a_message_is_one_printable_line_whatever_is_in_it() -> None:
+    message = str(QsgmError("mug\x1b[31m\nred\u202e\udcff" + "x" * 10**6))
+    assert message.isprintable()
+    assert message.startswith("mug\\x1b[31m\\nred\\u202e\\udcff")
+    assert len(message) < 10_000
+    assert as_text("日本語 grüße") == "日本語 grüße"

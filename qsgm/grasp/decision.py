@@ -61,17 +61,20 @@ class Decision:
         if not isinstance(values, Mapping) or values.get("evidence") != list(NAMES):
             raise QsgmError(f"{where}: the decision weighs other evidence; {_ADVICE}")
         try:
-            hidden_bias = np.array(values["hidden_bias"], np.float32)
-            hidden = np.array(values["hidden"], np.float32).reshape(len(hidden_bias), len(NAMES))
-            decision = Decision(
-                np.array(values["mean"], np.float32).reshape(len(NAMES)),
-                np.array(values["deviation"], np.float32).reshape(len(NAMES)),
-                hidden,
-                hidden_bias,
-                np.array(values["output"], np.float32).reshape(len(hidden_bias)),
-                float(values["bias"]),
-                float(values["threshold"]),
-            )
+            with np.errstate(over="ignore"):  # infinity is refused below
+                hidden_bias = np.array(values["hidden_bias"], np.float32)
+                hidden = np.array(values["hidden"], np.float32).reshape(
+                    len(hidden_bias), len(NAMES)
+                )
+                decision = Decision(
+                    np.array(values["mean"], np.float32).reshape(len(NAMES)),
+                    np.array(values["deviation"], np.float32).reshape(len(NAMES)),
+                    hidden,
+                    hidden_bias,
+                    np.array(values["output"], np.float32).reshape(len(hidden_bias)),
+                    float(values["bias"]),
+                    float(values["threshold"]),
+                )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise QsgmError(f"{where}: the decision's numbers do not fit; {_ADVICE}") from error
         _check(decision, where)

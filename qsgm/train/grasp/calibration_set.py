@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -12,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.files import is_plain, read_file
 from qsgm.grasp.lesson import GraspLesson
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask
-from qsgm.images import read_demonstration
+from qsgm.images import MAX_FILE_BYTES, check_demonstration, decode_frame
 from qsgm.train.grasp.task import frame_lesson, shipped_things
 
 MANIFEST = "manifest.json"
 FORMAT, VERSION = "qsgm-calibration", 1
+MANIFEST_BYTES = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,9 @@ class CalibrationSet:
         self.folder = folder
         path = folder / MANIFEST
         try:
-            self.manifest_bytes = path.read_bytes()
+            what = f"a calibration set that `qsgm draw-calibration -o {folder}` made"
+            self.manifest_bytes = read_file(path, MANIFEST_BYTES, what)
             self._entries = _entries(json.loads(self.manifest_bytes))
-        except OSError as error:
-            raise QsgmError(
-                f"{folder} is no calibration set, it has no {MANIFEST};"
-                f" make one with `qsgm draw-calibration -o {folder}`"
-            ) from error
         except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
             raise QsgmError(
                 f'{path} is damaged: expected {{"frames": [{{"file", "sha256", "center_px"}}]}};'
@@ -59,8 +56,10 @@ class CalibrationSet:
     def __getitem__(self, i: int) -> Demonstration:
         entry = self._entries[i]
         path = self.folder / entry.file
-        image = read_demonstration(path)
-        if hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
+        data = read_file(path, MAX_FILE_BYTES, "a frame")
+        image = decode_frame(data, path)
+        check_demonstration(image, path)
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise QsgmError(
                 f"{path} is not the frame the manifest describes (its sha256"
                 " differs); restore it or make the set again with `qsgm draw-calibration`"
@@ -115,7 +114,7 @@ def _entries(manifest: Any) -> list[_Entry]:
 
 
 def _entry(file: Any, sha256: Any, center_px: Any) -> _Entry:
-    if not isinstance(file, str) or not _is_plain(file):
+    if not is_plain(file):
         raise ValueError(f"not a plain file name: {file!r}")
     if not isinstance(sha256, str):
         raise TypeError(f"no digest: {sha256!r}")
@@ -124,8 +123,3 @@ def _entry(file: Any, sha256: Any, center_px: Any) -> _Entry:
         if type(value) not in (int, float) or not isfinite(value) or value < 0:
             raise ValueError(f"no place in a frame: {center_px!r}")
     return _Entry(file, sha256, (x, y))
-
-
-def _is_plain(name: str) -> bool:
-    """Whether a name stays in its folder, and in its line of a message."""
-    return name.isprintable() and not re.search(r"[/\\]", name) and name not in ("", ".", "..")
