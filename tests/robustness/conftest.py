@@ -41,9 +41,13 @@ def campaign(request: pytest.FixtureRequest) -> Campaign:
     """
 
     def run(script: str, *arguments: object, rounds: int = 1) -> dict[str, int]:
-        command = [sys.executable, str(HERE / script), *map(str, arguments)]
+        command = [sys.executable, "-m", f"robustness.{script}", *map(str, arguments)]
         done = subprocess.run(
-            [*command, str(SEED), str(rounds * TIMES)], capture_output=True, text=True, check=False
+            [*command, str(SEED), str(rounds * TIMES)],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, f"{done.returncode}\n{done.stdout}\n{done.stderr[-4000:]}"
         counts: dict[str, int] = json.loads(done.stdout.splitlines()[-1])

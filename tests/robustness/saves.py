@@ -18,13 +18,13 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import file_events
 import numpy as np
 
 from qsgm import QsgmError, files
 from qsgm.grasp.patch import Patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import ObjectDescription, load_object, save_object
+from robustness import file_events
 
 RNG = np.random.default_rng(0)
 PATCH = Patch(

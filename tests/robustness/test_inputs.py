@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import saves
-from conftest import Campaign
 
 from qsgm.bundle import Bundle
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.tuned import ObjectDescription, save_object
+from robustness import saves
+from robustness.conftest import Campaign
 
 TOP = Path(__file__).parents[2]
 # How many inputs CI tries, by what one of them takes.
@@ -52,7 +52,7 @@ def decision() -> Decision:
 def test_a_broken_file_is_read_or_refused_in_one_line(
     campaign: Campaign, material: Path, tmp_path: Path, reader: str
 ) -> None:
-    counts = campaign("inputs.py", reader, tmp_path / "in", material, rounds=READERS[reader])
+    counts = campaign("inputs", reader, tmp_path / "in", material, rounds=READERS[reader])
     assert counts["refused"]
     assert counts["accepted"]
     assert counts["inputs"] == counts["refused"] + counts["accepted"]

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
-from conftest import Campaign
 
 from qsgm.bundle import Bundle
+from robustness.conftest import Campaign
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +23,7 @@ def networks(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> list[P
 def test_a_signal_before_any_file_event_leaves_the_old_or_the_new(
     campaign: Campaign, networks: list[Path], tmp_path: Path, name: str
 ) -> None:
-    counts = campaign("saves.py", name, tmp_path / "save", *networks)
+    counts = campaign("saves", name, tmp_path / "save", *networks)
     assert counts["signals"] > 10
     assert counts["left the new"] < counts["signals"]
 
@@ -31,17 +31,17 @@ def test_a_signal_before_any_file_event_leaves_the_old_or_the_new(
 def test_a_power_loss_before_any_file_event_leaves_the_old_or_the_new(
     campaign: Campaign, networks: list[Path], tmp_path: Path
 ) -> None:
-    assert campaign("saves.py", "power_loss", tmp_path / "save", *networks)["power losses"] > 60
+    assert campaign("saves", "power_loss", tmp_path / "save", *networks)["power losses"] > 60
 
 
 def test_a_disk_that_fills_up_leaves_the_old_or_the_new(
     campaign: Campaign, networks: list[Path], tmp_path: Path
 ) -> None:
-    counts = campaign("saves.py", "full_disk", tmp_path / "save", *networks, rounds=12)
+    counts = campaign("saves", "full_disk", tmp_path / "save", *networks, rounds=12)
     assert counts["refused"]
 
 
 def test_eight_processes_save_and_load_one_object(
     campaign: Campaign, networks: list[Path], tmp_path: Path
 ) -> None:
-    campaign("saves.py", "eight", tmp_path / "save", *networks, rounds=3)
+    campaign("saves", "eight", tmp_path / "save", *networks, rounds=3)

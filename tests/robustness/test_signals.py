@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HERE, SEED, TIMES
 
 from qsgm import load_object
+from robustness.conftest import HERE, SEED, TIMES
 
 CODES = {"SIGINT": 130, "SIGTERM": 143}
 LOOK_UPS = 900  # `qsgm finetune` has some more
