@@ -18,14 +18,16 @@ from qsgm.runtime import check_interface, open_session, run_options, running
 from qsgm.sgm.int8 import U8_ZERO, around_zero_point
 from qsgm.train.graphs.inspection import integer_operators
 
+LAST, ALL = range(4, 7), range(1, 7)
+
 
 @pytest.mark.parametrize(
     "name",
     [
-        trunk_file("int8", 3),
+        trunk_file("int8", LAST),
         probe_file(3),
-        step_file("int8", "sgd", single_layers(3)),
-        step_file("int8", "sgd", single_layers(6)),
+        step_file("int8", "sgd", single_layers(LAST)),
+        step_file("int8", "sgd", single_layers(ALL)),
     ],
 )
 def test_no_graph_multiplies_by_s8_which_saturates_on_cpus_without_vnni(
@@ -55,13 +57,13 @@ def test_weights_around_their_zero_point_are_exact_where_pairs_exceed_16_bits() 
 
 
 def test_int8_sgms_run_as_integer_products_with_these_settings(bundle: Bundle) -> None:
-    model = onnx.load(bundle.folder / step_file("int8", "sgd", single_layers(3)))
+    model = onnx.load(bundle.folder / step_file("int8", "sgd", single_layers(LAST)))
     assert set(integer_operators(model)) == {"QGemm"}
 
 
 def test_a_run_that_gives_its_memory_back_gives_the_same(bundle: Bundle) -> None:
-    session = bundle.session(trunk_file("float", 3))
-    feeds = {"crops": np.random.default_rng(0).integers(0, 256, (2, 128, 128, 3), np.uint8)}
+    session = bundle.session(trunk_file("float", LAST))
+    feeds = {"samples": np.random.default_rng(0).integers(0, 256, (2, 128, 128, 3), np.uint8)}
     options = run_options(give_memory_back=True)
     assert options.get_run_config_entry("memory.enable_memory_arena_shrinkage") == "cpu:0"
     plain, frugal, again = (session.run(None, feeds, some)[0] for some in (None, options, None))
@@ -180,7 +182,7 @@ def test_numbers_in_a_files_bytes_are_read_from_them_and_not_from_the_working_fo
 
 @pytest.mark.parametrize("end", range(1, 400, 7))
 def test_the_walk_finds_what_onnx_finds_or_refuses(end: int, bundle: Bundle) -> None:
-    whole = bytearray((bundle.folder / step_file("int8", "sgd", single_layers(3))).read_bytes())
+    whole = bytearray((bundle.folder / step_file("int8", "sgd", single_layers(LAST))).read_bytes())
     rng = np.random.default_rng(end)
     for place in rng.integers(0, len(whole), 3):
         whole[place] = rng.integers(256)
@@ -210,13 +212,13 @@ CROPS = ("tensor(uint8)", (None, 128, 128, 3))
 
 
 def test_the_interface_of_a_graph_is_checked_by_name_type_and_shape(bundle: Bundle) -> None:
-    session = bundle.session(trunk_file("float", 3))
-    takes, gives = {"crops": CROPS}, {"features": ("tensor(uint8)", (None, None, None))}
+    session = bundle.session(trunk_file("float", LAST))
+    takes, gives = {"samples": CROPS}, {"features": ("tensor(uint8)", (None, None, None))}
     check_interface(session, "it", takes, gives, "mend it")
     for inputs, outputs in (
-        ({"crops": ("tensor(float)", CROPS[1])}, gives),
-        ({"crops": ("tensor(uint8)", CROPS[1][1:])}, gives),
-        ({"crops": ("tensor(uint8)", (None, 127, 128, 3))}, gives),
+        ({"samples": ("tensor(float)", CROPS[1])}, gives),
+        ({"samples": ("tensor(uint8)", CROPS[1][1:])}, gives),
+        ({"samples": ("tensor(uint8)", (None, 127, 128, 3))}, gives),
         ({}, gives),
         (takes | {"more": CROPS}, gives),
         (takes, gives | {"more": CROPS}),
@@ -242,7 +244,7 @@ def test_a_graph_that_runs_out_of_memory_is_refused() -> None:
 def test_a_graph_that_does_not_fit_its_inputs_is_refused_in_one_line(
     bundle: Bundle, feeds: dict[str, np.ndarray]
 ) -> None:
-    session = bundle.session(trunk_file("float", 3))
+    session = bundle.session(trunk_file("float", LAST))
     refused = pytest.raises(QsgmError, match=r"a graph of it does not fit .*; mend it")
     with refused as raised, running("it", "mend it"):
         session.run(None, feeds)

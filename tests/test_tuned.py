@@ -125,7 +125,7 @@ def test_a_description_that_says_nonsense_is_refused(saved: Path, key: str, valu
 def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Path) -> None:
     save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_float_6.onnx").read_bytes(), {})
     text = refusal(tmp_path / "mug")
-    assert "takes {'crops': ('tensor(uint8)', " in text
+    assert "takes {'samples': ('tensor(uint8)', " in text
     assert "expected {'frame': ('tensor(uint8)', (None, None, 3))}; tune the object again" in text
 
 
@@ -167,7 +167,7 @@ def named(name: str) -> ObjectDescription:
 
 def other_network(bundle: Bundle) -> bytes:
     """The bundle's with one weight changed."""
-    weights = bundle.start_weights(1)
+    weights = bundle.start_weights(bundle.network.last(1))
     weights["bias6"] = weights["bias6"] + 1
     return bundle.network_with(weights)
 

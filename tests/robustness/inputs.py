@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from qsgm import QsgmError, files, load_bundle, load_object, paths, read_frame
+from qsgm.grasp.task import distractors_of, task_of
 from qsgm.grasp.tuned import DESCRIPTION
 
 ADDRESS_SPACE = 8 * 2**30  # what numpy, OpenCV and torch reserve without using it is part of it
@@ -166,13 +167,14 @@ def bundle(folder: Path, material: Path, rng: Rng) -> None:
         manifest["files"][name]["sha256"] = sha256(data)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     loaded = load_bundle(folder)
-    assert loaded.encoding in ("double", "paper")
-    loaded.network_with(loaded.start_weights(loaded.most_layers))
-    loaded.distractors()
-    for layer in range(7 - loaded.most_layers, 6):
+    task_of(loaded)
+    distractors_of(loaded)
+    tuned = loaded.network.last(loaded.manifest.most_layers)
+    loaded.network_with(loaded.start_weights(tuned))
+    for layer in loaded.manifest.sgms:
         loaded.float_sgm(layer)
     for name in names[:: 1 + int(rng.integers(len(names)))]:
-        if name.endswith(".onnx") and name in loaded.manifest["files"]:
+        if name.endswith(".onnx") and loaded.has(name):
             loaded.session(name)
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from toys import by_correlation
 
 from qsgm.bundle import Bundle
-from qsgm.grasp.decision import Decision
 from qsgm.grasp.tuned import ObjectDescription, save_object
 from robustness import saves
 from robustness.conftest import Campaign
@@ -30,7 +30,9 @@ def material(bundle: Bundle, frames_folder: Path, tmp_path_factory: pytest.TempP
     folder = tmp_path_factory.mktemp("material")
     (folder / "bundle").symlink_to(bundle.folder)
     (folder / "sgm.pt").write_bytes((TOP / "sgm.pt").read_bytes())
-    about = ObjectDescription("mug", "double", 0.25, 1.0, saves.VIEWS, decision(), {"seed": 0})
+    about = ObjectDescription(
+        "mug", "double", 0.25, 1.0, saves.VIEWS, by_correlation(), {"seed": 0}
+    )
     save_object(folder / "object", about, bundle.network_with({}), {})
     frame = cv2.resize(cv2.imread(str(frames_folder / "bar.png")), (200, 150))
     for name, flags in (("frame.png", []), ("frame.jpg", []), ("frame.progressive", [2, 1])):
@@ -41,11 +43,6 @@ def material(bundle: Bundle, frames_folder: Path, tmp_path_factory: pytest.TempP
     entry = {"file": "a.png", "sha256": "0" * 64, "center_px": [320, 240]}
     (folder / "frames.json").write_text(json.dumps({"frames": [entry]}))
     return folder
-
-
-def decision() -> Decision:
-    manifest = json.loads((TOP / "export" / "manifest.json").read_text())
-    return Decision.from_json(manifest["decision"], "export")
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -12,7 +12,7 @@ from robustness.conftest import Campaign
 def networks(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two, of which one differs in a bias."""
     folder = tmp_path_factory.mktemp("networks")
-    weights = bundle.start_weights(1)
+    weights = bundle.start_weights(bundle.network.last(1))
     weights["bias6"] = weights["bias6"] + 1
     for name, changed in (("old", {}), ("new", weights)):
         (folder / f"{name}.onnx").write_bytes(bundle.network_with(changed))
