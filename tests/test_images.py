@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.grasp.teach import as_demonstrations
 from qsgm.images import check_demonstration, check_frame, read_demonstration, read_frame, write_png
 
 
@@ -272,6 +273,12 @@ def test_an_array_that_is_no_frame_is_refused_in_one_line_that_blames_it(frame: 
     with pytest.raises(QsgmError, match=r"^the frame is .*: expected .*; ") as raised:
         check_frame(frame)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("frames", [None, "a.png", [None], np.zeros((480, 640), np.uint8)], ids=str)
+def test_a_demonstration_that_is_no_frame_is_refused_before_anything_runs(frames: Any) -> None:
+    with pytest.raises(QsgmError, match="the frame is"):
+        as_demonstrations(frames)
 
 
 def test_a_frame_seen_in_a_mirror_is_a_frame() -> None:

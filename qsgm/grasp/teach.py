@@ -31,6 +31,7 @@ from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import distractors_of, task_of
 from qsgm.grasp.tuned import ObjectDescription, TunedObject, save_object
 from qsgm.grasp.verdict import Verdict, verdict_on
+from qsgm.images import check_frame
 from qsgm.progress import Progress
 from qsgm.tune.plan import Plan, resolve
 from qsgm.tune.prepare import Prepared, prepare
@@ -183,14 +184,12 @@ def train_object(
 
 def as_demonstrations(frames: Frames) -> list[Demonstration]:
     """Frames, each with where its object is: at its middle where it does not say."""
-    some = [frames] if isinstance(frames, np.ndarray) else list(frames)
+    some = list(frames) if isinstance(frames, Sequence) else [frames]
     if not some:
         raise ValueError("`frames` must hold at least one frame")
     found = []
     for one in some:
-        frame = one.frame if isinstance(one, Demonstration) else one
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-            raise ValueError(f"`frame` must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+        frame = check_frame(one.frame if isinstance(one, Demonstration) else one)
         center = (frame.shape[1] / 2, frame.shape[0] / 2)
         found.append(one if isinstance(one, Demonstration) else Demonstration(frame, center))
     return found
