@@ -17,6 +17,7 @@ import secrets
 import shutil
 import stat
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,6 +35,7 @@ _WORKSHOP = re.compile(r"\.qsgm-[0-9a-f]{16}")
 _NEW, _OLD = "new", "old"
 # How often others may come in between before that is an error.
 _TRIES = 100
+_PAUSE_S = 0.005
 _OVERTAKEN = (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST)
 
 
@@ -87,9 +89,19 @@ def read_whole(folder: Path, load: Callable[[], Read]) -> Read:
         except QsgmError:
             if before is None:  # a replacement in two steps may have been cut short
                 _sweep(folder.parent)
-            if _identity(folder) == before:
+            looks = range(3)  # one might fall between the end of a replacement and the next
+            if all(_identity(folder) == before and not _is_between(folder) for _ in looks):
                 raise
+            time.sleep(_PAUSE_S)
     return load()
+
+
+def _is_between(folder: Path) -> bool:
+    """Whether a process has taken it away and not yet put another one in its place."""
+    with suppress(OSError):
+        others = folder.parent.glob(".qsgm-*")
+        return any((workshop / _OLD / folder.name).exists() for workshop in others)
+    return False
 
 
 def is_plain(name: object) -> TypeGuard[str]:
@@ -168,6 +180,10 @@ def check_replaceable(path: Path, marker: str) -> None:
         QsgmError: names what stands in the way.
     """
     final = _resolved(path)
+    read_whole(final, lambda: _check_replaceable(path, final, marker))
+
+
+def _check_replaceable(path: Path, final: Path, marker: str) -> None:
     try:
         if not final.exists():
             return

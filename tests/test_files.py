@@ -395,3 +395,44 @@ def test_a_message_is_one_printable_line_whatever_is_in_it() -> None:
     assert message.startswith("mug\\x1b[31m\\nred\\u202e\\udcff")
     assert len(message) < 10_000
     assert as_text("日本語 grüße") == "日本語 grüße"
+
+
+def test_a_folder_that_another_process_is_about_to_replace_is_waited_for(tmp_path: Path) -> None:
+    write_object(tmp_path / "mug", "old")
+    tried = 0
+
+    with files._workshop(tmp_path) as workshop:  # held, as by another process
+        taken_away = workshop / "old" / "mug"
+        taken_away.parent.mkdir()
+        (tmp_path / "mug").rename(taken_away)
+
+        def load() -> str:
+            nonlocal tried
+            tried += 1
+            if tried == 3:
+                taken_away.rename(tmp_path / "mug")
+            if not (tmp_path / "mug").exists():
+                raise QsgmError("there is nothing")
+            return (tmp_path / "mug" / MARKER).read_text()
+
+        assert read_whole(tmp_path / "mug", load) == "old"
+    assert tried == 3
+
+
+def test_an_output_that_is_replaced_while_it_is_checked_is_checked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_object(tmp_path / "mug", "old")
+    entries, replaced = files._entries, False
+
+    def replacing(folder: Path) -> Iterator[str]:
+        nonlocal replaced
+        if not replaced and folder == tmp_path / "mug":
+            replaced = True
+            write_object(folder, "new")
+            raise FileNotFoundError(2, "No such file or directory")
+        return entries(folder)
+
+    monkeypatch.setattr(files, "_entries", replacing)
+    check_replaceable(tmp_path / "mug", MARKER)
+    assert replaced

@@ -232,13 +232,8 @@ def _caption(canvas: _Canvas, detection: Detection, title: str, found: int) -> P
     verdict_width = _text_width(verdict, unit * 0.85, bold=True)
     _text(panel, verdict, (width - 36 * unit - verdict_width, 44 * unit), unit * 0.85, accent, True)
     room = width - 110 * unit - verdict_width
-    _text(
-        panel,
-        _shortened(as_text(title), room, unit * 0.85),
-        (36 * unit, 44 * unit),
-        unit * 0.85,
-        _VALUE,
-    )
+    title = _shortened(as_text(title), room, unit * 0.85)
+    _text(panel, title, (36 * unit, 44 * unit), unit * 0.85, _VALUE)
     for column, (label, value) in enumerate(_values(detection)):
         x = (36 + 310 * column) * unit
         _text(panel, label, (x, 86 * unit), unit * 0.6, _LABEL)
