@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,34 +12,51 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from toys import bump, by_correlation, lay, table, toy
+from toys import bump, by_correlation, lay, table, toy, with_decision
 
 from qsgm import QsgmError, finetune, load_bundle, load_object
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle
+from qsgm.grasp import teach
 from qsgm.grasp.angles import encode_angle
 from qsgm.grasp.crops import CROPS, TRAIN_CROPS, cut_crops, plan_crops
-from qsgm.grasp.others import other_in
+from qsgm.grasp.lesson import GraspLabels, GraspLesson, Orientation
+from qsgm.grasp.others import Other, other_in
 from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
-from qsgm.grasp.teach import FinetuneResult
+from qsgm.grasp.task import distractors_of
+from qsgm.grasp.teach import (
+    FinetuneResult,
+    PreparedObject,
+    prepare_object,
+    train_object,
+    tune_object,
+)
 from qsgm.grasp.tuned import MARGIN_PX
-from qsgm.manifest import Precision, head_file
+from qsgm.manifest import PRECISIONS, FileEntry, Precision, head_file
 from qsgm.schedule import BATCH
 from qsgm.sgm.int8 import SgmRanges, constants, quantize_sgm
 from qsgm.tables import to_json
-from qsgm.tune import prepare as preparing
-from qsgm.tune import probe as probing
-from qsgm.tune import run as finetuning
 from qsgm.tune.features import SLICE, StreamedFeatures
-from qsgm.tune.plan import peak_activation_bytes
-from qsgm.tune.prepare import Accuracy, accuracy_of, prepare
-from qsgm.tune.run import train
+from qsgm.tune.plan import peak_activation_bytes, resolve
 from qsgm.tune.settings import Settings
 from qsgm.weights import to_step_layout
 
 Frame = NDArray[np.uint8]
 SHORT = Settings(precision="int8", epochs=2)
+
+
+def prepared_by(
+    settings: Settings, frame: Frame | Demonstration, bundle: Bundle, others: Sequence[Other] = ()
+) -> PreparedObject:
+    """What a run with these settings starts from."""
+    frames = frame if isinstance(frame, np.ndarray) else [frame]
+    return prepare_object(frames, bundle, resolve(settings, bundle), others=others)
+
+
+def tuned_by(settings: Settings, prepared: PreparedObject) -> FinetuneResult:
+    """One run on what was prepared."""
+    return tune_object(prepared, resolve(settings, prepared.bundle))
 
 
 def planned(
@@ -49,7 +67,7 @@ def planned(
 ) -> CropSource:
     """The crops of a run with seed 0."""
     shown = Demonstration(frame, center_px)
-    return crop_source([shown], bundle.distractors(), np.random.default_rng(0), count)
+    return crop_source([shown], distractors_of(bundle), np.random.default_rng(0), count)
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +80,8 @@ def test_the_same_seed_gives_the_same_result(
 ) -> None:
     again = finetune(frame, bundle, SHORT)
     assert again.network() == result.network()
-    assert (again.accuracy, again.losses, again.probes) == (
-        result.accuracy,
+    assert (again.scores, again.losses, again.probes) == (
+        result.scores,
         result.losses,
         result.probes,
     )
@@ -80,7 +98,7 @@ def test_crops_cut_in_slices_have_the_features_of_crops_cut_at_once(
     frame: Frame, bundle: Bundle, result: FinetuneResult
 ) -> None:
     crops = planned(frame, bundle).cut(np.arange(60))
-    expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
+    expected = bundle.session("trunk_float_3.onnx").run(None, {"samples": crops})[0]
     assert len(result.prepared.features) == CROPS
     np.testing.assert_allclose(result.prepared.features[:60], expected, atol=1e-5)
 
@@ -88,27 +106,28 @@ def test_crops_cut_in_slices_have_the_features_of_crops_cut_at_once(
 def test_the_frozen_layers_run_in_the_precision_asked_for(
     frame: Frame, bundle: Bundle, result: FinetuneResult
 ) -> None:
-    prepared = prepare(frame, bundle, replace(SHORT, trunk="int8"))
+    prepared = prepared_by(replace(SHORT, trunk="int8"), frame, bundle)
     crops = planned(frame, bundle).cut(np.arange(20))
-    expected = bundle.session("trunk_int8_3.onnx").run(None, {"crops": crops})[0]
+    expected = bundle.session("trunk_int8_3.onnx").run(None, {"samples": crops})[0]
     np.testing.assert_array_equal(prepared.features[:20], expected)
     assert not np.array_equal(prepared.features, result.prepared.features)
-    assert (train(prepared, SHORT).trunk, result.trunk) == ("int8", "float")
+    trunks = tuned_by(SHORT, prepared).prepared.plan.trunk, result.prepared.plan.trunk
+    assert trunks == ("int8", "float")
 
 
 def test_the_object_may_lie_elsewhere_in_the_frame(frame: Frame, bundle: Bundle) -> None:
-    prepared = prepare(frame, bundle, replace(SHORT, center_px=(250.0, 280.0)))
+    prepared = prepared_by(SHORT, Demonstration(frame, (250.0, 280.0)), bundle)
     crops = planned(frame, bundle, (250.0, 280.0)).cut(np.arange(20))
-    expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
+    expected = bundle.session("trunk_float_3.onnx").run(None, {"samples": crops})[0]
     np.testing.assert_allclose(prepared.features[:20], expected, atol=1e-5)
     with pytest.raises(QsgmError, match="outside of the 640x480 frame"):
-        prepare(frame, bundle, replace(SHORT, center_px=(640.5, 240.0)))
+        prepared_by(SHORT, Demonstration(frame, (640.5, 240.0)), bundle)
 
 
 def test_an_object_at_the_border_is_taught_with_its_frame_continued(
     frame: Frame, bundle: Bundle
 ) -> None:
-    prepared = prepare(frame, bundle, replace(SHORT, center_px=(30.0, 240.0)))
+    prepared = prepared_by(SHORT, Demonstration(frame, (30.0, 240.0)), bundle)
     (shown,) = prepared.shown.demonstrations
     assert shown.frame.shape == (480, 640 + 66, 3)
     assert shown.center_px == (96.0, 240.0)
@@ -120,13 +139,13 @@ def test_labels_are_shifted_by_the_orientation_the_network_sees(
     prepared = result.prepared
     plan = planned(frame, prepared.bundle).plan
     positive = plan.quality > 0
-    expected = encode_angle(plan.turn_rad + np.float32(prepared.offset_rad))
+    expected = encode_angle(plan.turn_rad + np.float32(prepared.orientation.offset_rad))
     np.testing.assert_allclose(prepared.labels[positive, 1:], expected[positive], atol=1e-5)
     assert (prepared.labels[~positive] == 0).all()
-    assert 0 <= prepared.offset_strength <= 1
+    assert 0 <= prepared.orientation.strength <= 1
 
 
-def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180(bundle: Bundle) -> None:
+def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180() -> None:
     angles = np.radians([10.0, 80.0, 0.0, 0.0])
     labels = np.array([[1, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]], np.float32)
     seen = np.concatenate(
@@ -136,9 +155,12 @@ def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180(bundle: 
         ],
         axis=1,
     )
-    accuracy = accuracy_of(seen, labels, angles, bundle)
-    assert accuracy.detection_accuracy == 0.5
-    assert accuracy.angle_mae_deg == pytest.approx((2 + 4) / 2, abs=1e-4)
+    untouched = Orientation(0.0, 1.0, (0.0,))
+    known = GraspLabels(labels, angles, np.zeros(4, np.uint8), untouched, "double")
+    scores = known.scores(seen, np.arange(4))
+    for ending in ("", "_plain"):
+        assert scores[f"detection_accuracy{ending}"] == 0.5
+        assert scores[f"angle_mae_deg{ending}"] == pytest.approx((2 + 4) / 2, abs=1e-4)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 3])
@@ -148,7 +170,8 @@ def test_every_method_tunes_every_number_of_layers(
 ) -> None:
     settings = Settings(precision="int8", method=method, layers=layers, epochs=1)  # type: ignore[arg-type]
     result = finetune(frame, bundle, settings)
-    assert set(result.fidelity) == set(single_layers(layers).sgm_layers)
+    last = bundle.network.last(layers)
+    assert set(result.fidelity) == set(single_layers(last).sgm_layers)
     assert (
         str(result.blocks)
         == {
@@ -157,19 +180,18 @@ def test_every_method_tunes_every_number_of_layers(
         }[method][layers - 1]
     )
     assert len(result.probes) == (2 if layers > 1 else 0)
-    start = bundle.start_weights(layers)
+    start = bundle.start_weights(last)
     assert set(result.weights) == set(start)
     assert all(result.weights[name].shape == start[name].shape for name in start)
     assert any(not np.array_equal(result.weights[name], start[name]) for name in start)
-    assert result.settings.precision == ("float" if method == "bp" else "int8")
+    assert result.plan.precision == ("float" if method == "bp" else "int8")
 
 
 @pytest.fixture
 def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers 1 to 3 see large maps."""
-    for module in (preparing, probing, finetuning):
-        monkeypatch.setattr(module, "TRAIN_CROPS", 64)
-    monkeypatch.setattr(preparing, "crop_source", partial(crop_source, count=96))
+    monkeypatch.setattr(teach, "GraspLesson", partial(GraspLesson, taught=64))
+    monkeypatch.setattr(teach, "crop_source", partial(crop_source, count=96))
 
 
 @pytest.mark.usefixtures("few_crops")
@@ -190,7 +212,7 @@ def test_all_layers_can_be_tuned_alone_or_in_blocks(
     result = finetune(frame, bundle, settings)
     assert set(result.fidelity) == probed
     assert result.prepared.features.dtype == np.uint8
-    start = bundle.start_weights(settings.layers)
+    start = bundle.start_weights(bundle.network.last(settings.layers))
     assert set(result.weights) == set(start)
     for name, value in start.items():
         assert not np.array_equal(result.weights[name], value), name
@@ -236,7 +258,7 @@ def test_six_tuned_layers_see_the_crops_as_the_whole_network_does(
 def test_blocks_that_cannot_be_trained_are_refused_before_any_work(
     frame: Frame, bundle: Bundle, settings: Settings, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preparing, "crop_source", pytest.fail)
+    monkeypatch.setattr(teach, "crop_source", pytest.fail)
     with pytest.raises(QsgmError, match=said) as raised:
         finetune(frame, bundle, settings)
     assert "\n" not in str(raised.value)
@@ -250,12 +272,15 @@ def test_backpropagation_may_be_asked_for_by_its_one_block(frame: Frame, bundle:
 def test_backpropagation_lowers_the_loss(frame: Frame, bundle: Bundle) -> None:
     result = finetune(frame, bundle, Settings(method="bp", epochs=6))
     assert result.losses[-1] < 0.9 * result.losses[0]
-    assert result.accuracy.detection_accuracy > result.zero_shot.detection_accuracy
+    before, after = (one["detection_accuracy"] for one in (result.untouched, result.scores))
+    assert before is not None
+    assert after is not None
+    assert after > before
 
 
 def test_no_epochs_leave_the_network_as_it_was(frame: Frame, bundle: Bundle) -> None:
     result = finetune(frame, bundle, Settings(precision="int8", epochs=0))
-    assert result.accuracy == result.zero_shot
+    assert result.scores == result.untouched
     assert result.network() == (bundle.folder / "network.onnx").read_bytes()
     assert result.losses == ()
 
@@ -299,9 +324,9 @@ def test_the_report_beside_the_object_keeps_the_whole_run(
 def assert_same_run(one: FinetuneResult, other: FinetuneResult) -> None:
     """To the last bit."""
     assert one.network() == other.network()
-    assert (one.zero_shot, one.accuracy) == (other.zero_shot, other.accuracy)
+    assert (one.untouched, one.scores) == (other.untouched, other.scores)
     assert (one.losses, one.probes) == (other.losses, other.probes)
-    assert one.prepared.offset_rad == other.prepared.offset_rad
+    assert one.prepared.orientation.offset_rad == other.prepared.orientation.offset_rad
 
 
 @pytest.mark.parametrize(
@@ -339,7 +364,7 @@ def test_features_of_a_crop_are_the_same_in_any_batch(
     frame: Frame, bundle: Bundle, trunk: Precision, layers: int
 ) -> None:
     settings = Settings(precision="int8", layers=layers, trunk=trunk, stream=True)
-    source = prepare(frame, bundle, settings).source
+    source = prepared_by(settings, frame, bundle).source
     rows = np.random.default_rng(0).permutation(CROPS)[:75]
     together = source.of(rows)
     np.testing.assert_array_equal(source.of(rows[40:72]), together[40:72])
@@ -376,13 +401,15 @@ def test_stages_add_up_to_no_more_than_the_total(result: FinetuneResult) -> None
 def test_preparing_once_and_training_twice_equals_two_whole_runs(
     frame: Frame, bundle: Bundle, result: FinetuneResult
 ) -> None:
-    prepared = prepare(frame, bundle, SHORT)
-    train(prepared, replace(SHORT, method="bp"))
-    second = train(prepared, SHORT, probe=False)
+    prepared = prepared_by(SHORT, frame, bundle)
+    tuned_by(replace(SHORT, method="bp"), prepared)
+    second = train_object(prepared, resolve(SHORT, bundle))
     assert second.network() == result.network()
     assert second.probes == ()
-    with pytest.raises(ValueError, match="prepared for 3 layers, not for 2"):
-        train(prepared, replace(SHORT, layers=2))
+    with pytest.raises(
+        ValueError, match=r"prepared for layers range\(4, 7\), not for range\(5, 7\)"
+    ):
+        tuned_by(replace(SHORT, layers=2), prepared)
 
 
 def test_progress_is_told_stage_by_stage(frame: Frame, bundle: Bundle) -> None:
@@ -404,7 +431,7 @@ def test_training_that_diverges_names_the_step_and_what_to_do(
 
 
 def test_more_layers_than_the_bundle_has_are_refused(frame: Frame, bundle: Bundle) -> None:
-    small = replace(bundle, manifest=bundle.manifest | {"most_layers": 2})
+    small = replace(bundle, manifest=replace(bundle.manifest, most_layers=2))
     with pytest.raises(QsgmError, match="2 layers at most, not 3; pass --layers 2"):
         finetune(frame, small, SHORT)
 
@@ -417,16 +444,19 @@ def test_what_is_no_frame_is_a_programming_error(frame: Frame, bundle: Bundle) -
 
 
 def test_a_run_in_float_never_warns_of_drift(frame: Frame, bundle: Bundle) -> None:
-    prepared = prepare(frame, bundle, SHORT)
+    prepared = prepared_by(SHORT, frame, bundle)
     narrow = {}
     for layer in (4, 5):
         sgm = bundle.float_sgm(layer)
         low, *highs = (np.zeros(19, np.float32), *(np.full(n, 1e-4, np.float32) for n in (19, 12)))
         low[-2:] = -1
         narrow[layer] = constants(quantize_sgm(sgm, SgmRanges(low, highs[0], (highs[1],))))
-    assert train(prepared, SHORT, exchanged=narrow).warnings
-    in_float = replace(SHORT, precision="float")
-    assert train(prepared, in_float, exchanged=narrow).warnings == ()
+    int8, in_float = (
+        replace(resolve(replace(SHORT, precision=one), bundle), overrides=narrow)
+        for one in PRECISIONS
+    )
+    assert tune_object(prepared, int8).warnings
+    assert tune_object(prepared, in_float).warnings == ()
 
 
 def test_a_run_says_what_memory_its_steps_take_where_the_bundle_does(bundle: Bundle) -> None:
@@ -434,24 +464,24 @@ def test_a_run_says_what_memory_its_steps_take_where_the_bundle_does(bundle: Bun
         "sgm": None,
         "backprop": None,
     }
-    sizes = {"step_int8_sgd_4,5-6.onnx": 7, "step_float_adam_4-6.onnx": 9, "head_3.onnx": "much"}
-    files = {name: {"peak_activation_bytes": size} for name, size in sizes.items()}
-    told = replace(bundle, manifest=bundle.manifest | {"files": files})
+    sizes = {"step_int8_sgd_4,5-6.onnx": 7, "step_float_adam_4-6.onnx": 9, "head_3.onnx": None}
+    files = {name: FileEntry("", size) for name, size in sizes.items()}
+    told = replace(bundle, manifest=replace(bundle.manifest, files=files))
     found = peak_activation_bytes(told, "int8", parse_blocks("4,5-6"))
     assert found == {"sgm": 7, "backprop": 9}
     assert told.peak_activation_bytes("head_3.onnx") is None
 
 
 def test_int8_and_float_sgms_run_different_graphs(frame: Frame, bundle: Bundle) -> None:
-    prepared = prepare(frame, bundle, SHORT)
-    floating = train(prepared, replace(SHORT, precision="float")).weights["weight4"]
-    integers = train(prepared, SHORT).weights["weight4"]
+    prepared = prepared_by(SHORT, frame, bundle)
+    floating = tuned_by(replace(SHORT, precision="float"), prepared).weights["weight4"]
+    integers = tuned_by(SHORT, prepared).weights["weight4"]
     assert not np.array_equal(floating, integers)
     np.testing.assert_allclose(floating, integers, atol=0.05)
 
 
 def test_a_number_that_is_not_finite_becomes_null_not_nan(result: FinetuneResult) -> None:
-    broken = replace(result, accuracy=Accuracy(1.0, math.nan))
+    broken = replace(result, scores={**result.scores, "angle_mae_deg": math.nan})
     values = json.loads(to_json(finetune_json(broken, "mug", Path("mug"))))
     assert values["angle_mae_deg"] is None
 
@@ -463,7 +493,7 @@ def toy_frame(turn_deg: float = 0.0, seed: int = 0) -> Frame:
 def test_accuracy_is_told_with_other_things_on_the_crops_and_without(
     bundle: Bundle, result: FinetuneResult
 ) -> None:
-    prepared, accuracy = result.prepared, result.accuracy
+    prepared, scores = result.prepared, result.scores
     rows = np.arange(TRAIN_CROPS, CROPS)
     weights = {
         name: to_step_layout(value) if value.ndim > 1 else value
@@ -472,10 +502,10 @@ def test_accuracy_is_told_with_other_things_on_the_crops_and_without(
     head = bundle.session(head_file(3))
     outputs = head.run(None, {"features": prepared.features[rows], **weights})[0]
     right = (outputs[:, 0] > 0.5) == (prepared.labels[rows, 0] > 0)
-    addition, negative = prepared.addition[rows], prepared.labels[rows, 0] == 0
-    assert accuracy.detection_accuracy == pytest.approx(right.mean())
-    assert accuracy.detection_accuracy_plain == pytest.approx(right[addition == 0].mean())
-    assert accuracy.told_apart == pytest.approx(right[negative & (addition == 1)].mean())
+    addition, negative = prepared.labelled.addition[rows], prepared.labels[rows, 0] == 0
+    assert scores["detection_accuracy"] == pytest.approx(right.mean())
+    assert scores["detection_accuracy_plain"] == pytest.approx(right[addition == 0].mean())
+    assert scores["told_apart"] == pytest.approx(right[negative & (addition == 1)].mean())
     values = finetune_json(result, "mug", Path("mug"))
     for place in (values, values["zero_shot"]):
         assert {"detection_accuracy_plain", "angle_mae_deg_plain", "told_apart"} <= set(place)
@@ -484,17 +514,17 @@ def test_accuracy_is_told_with_other_things_on_the_crops_and_without(
 def test_a_bundle_without_things_gives_crops_of_the_frame_alone(
     frame: Frame, bundle: Bundle
 ) -> None:
-    files = {k: v for k, v in bundle.manifest["files"].items() if k != "distractors.png"}
-    old = replace(bundle, manifest=bundle.manifest | {"files": files})
-    assert old.distractors() is None
+    files = {k: v for k, v in bundle.manifest.files.items() if k != "distractors.png"}
+    old = replace(bundle, manifest=replace(bundle.manifest, files=files))
+    assert distractors_of(old) is None
     result = finetune(frame, old, replace(SHORT, epochs=1))
     plan = plan_crops((480, 640), (320, 240), np.random.default_rng(0))
     crops = cut_crops(frame, plan[:20])
-    expected = bundle.session("trunk_float_3.onnx").run(None, {"crops": crops})[0]
+    expected = bundle.session("trunk_float_3.onnx").run(None, {"samples": crops})[0]
     np.testing.assert_array_equal(result.prepared.features[:20], expected)
-    accuracy = result.accuracy
-    assert accuracy.detection_accuracy_plain == accuracy.detection_accuracy
-    assert accuracy.told_apart is None
+    scores = result.scores
+    assert scores["detection_accuracy_plain"] == scores["detection_accuracy"]
+    assert scores["told_apart"] is None
     assert "no other things" in " ".join(result.verdict.notes)
 
 
@@ -505,10 +535,10 @@ def test_several_demonstrations_share_one_meaning_of_the_angle(bundle: Bundle) -
     prepared = result.prepared
     crops = crop_source(
         [Demonstration(frame, (320.0, 240.0)) for frame in frames],
-        bundle.distractors(),
+        distractors_of(bundle),
         np.random.default_rng(0),
     )
-    true = crops.plan.turn_rad + np.radians(turn) * crops.shown + prepared.offset_rad
+    true = crops.plan.turn_rad + np.radians(turn) * crops.shown + prepared.orientation.offset_rad
     positive = crops.plan.quality > 0
     np.testing.assert_allclose(
         prepared.labels[positive, 1:], encode_angle(true[positive]), atol=0.02
@@ -526,7 +556,7 @@ def test_a_demonstration_that_looks_different_is_aligned_by_the_network_and_kept
     back = lay(toy()[..., [2, 1, 0, 3]], table(1), (320.0, 240.0), 70)
     result = finetune([toy_frame(), back], bundle, replace(SHORT, epochs=1))
     first, second = result.prepared.orientation.of_each_rad
-    assert first == result.prepared.offset_rad
+    assert first == result.prepared.orientation.offset_rad
     result.save(tmp_path / "toy", "toy")
     one, other = load_object(tmp_path / "toy").description.views
     assert (one.turn_rad, one.whole) == (0, True)
@@ -537,12 +567,13 @@ def test_a_demonstration_that_looks_different_is_aligned_by_the_network_and_kept
 def test_things_that_are_named_are_put_on_the_crops(bundle: Bundle) -> None:
     other = other_in(Demonstration(toy_frame(), (320.0, 240.0)))
     frame = lay(toy()[..., [1, 2, 0, 3]], table(2), (320.0, 240.0))
-    plain, named = (prepare(frame, bundle, SHORT, others=some) for some in ([], [other]))
-    again = prepare(frame, bundle, SHORT, others=[other])
+    plain, named = (prepared_by(SHORT, frame, bundle, some) for some in ([], [other]))
+    again = prepared_by(SHORT, frame, bundle, [other])
     assert not np.array_equal(plain.features, named.features)
     np.testing.assert_array_equal(again.features, named.features)
-    np.testing.assert_array_equal(plain.addition, named.addition)
-    alone = (plain.addition == 0) | (plain.addition == 2)
+    addition = plain.labelled.addition
+    np.testing.assert_array_equal(addition, named.labelled.addition)
+    alone = (addition == 0) | (addition == 2)
     np.testing.assert_array_equal(plain.features[alone], named.features[alone])
     assert named.others_sha256 == (other.sha256,)
 
@@ -553,8 +584,8 @@ def test_a_photograph_with_a_large_object_is_taught_and_found_in_its_own_pixels(
     """12 megapixels, an object of 800 px."""
     small = lay(toy(), table(0, (378, 504)), (252.0, 189.0), 25, 100 / 90)
     photograph = cv2.resize(small, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC)
-    manifest = bundle.manifest | {"decision": by_correlation().to_json()}
-    result = finetune(photograph, replace(bundle, manifest=manifest), replace(SHORT, epochs=1))
+    deciding = with_decision(bundle, by_correlation())
+    result = finetune(photograph, deciding, replace(SHORT, epochs=1))
     values = finetune_json(result, "toy", Path("toy"))
     assert values["span_px"] == pytest.approx(800, rel=0.1)
     assert values["scale"] == pytest.approx(90 / 800, rel=0.1)

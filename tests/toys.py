@@ -1,9 +1,12 @@
 """A made-up object with markings, laid into frames exactly where a test wants it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.bundle import Bundle
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.evidence import NAMES
 
@@ -106,3 +109,11 @@ def bump(
     return np.stack([quality, np.sin(2 * angle_rad) * ones, np.cos(2 * angle_rad) * ones]).astype(
         np.float32
     )
+
+
+def with_decision(bundle: Bundle, decision: Decision) -> Bundle:
+    """The same bundle with another decision on what is the object."""
+    task = bundle.manifest.task
+    settings = {**task.settings, "decision": decision.to_json()}
+    manifest = replace(bundle.manifest, task=replace(task, settings=settings))
+    return replace(bundle, manifest=manifest)
