@@ -20,7 +20,7 @@ from qsgm import __version__, cli, paths
 from qsgm.cli import app, commands, console
 from qsgm.errors import QsgmError
 from qsgm.manifest import NETWORK, trunk_file
-from qsgm.tune import run as finetuning
+from qsgm.tune import run as tuning
 from qsgm.tune.settings import Settings
 
 FINETUNE_KEYS = {
@@ -450,7 +450,8 @@ def test_all_instances_are_listed_in_json_in_a_table_and_in_the_picture(
 ) -> None:
     path = own_bundle / "manifest.json"
     manifest = json.loads(path.read_text())
-    path.write_text(json.dumps(manifest | {"decision": by_correlation(-10).to_json()}))
+    manifest["task"]["decision"] = by_correlation(-10).to_json()
+    path.write_text(json.dumps(manifest))
     outcome = qsgm(
         "finetune", "--json", "--epochs", 0, "--bundle", own_bundle, "-o", tmp_path / "o",
         toy_paths[0],
@@ -466,7 +467,8 @@ def test_all_instances_are_listed_in_json_in_a_table_and_in_the_picture(
         }  # fmt: skip
     assert cv2.imread(str(tmp_path / "all.png")) is not None
     assert f"o: {len(values['objects'])} found" in qsgm(*common).out.replace("toy:", "o:")
-    path.write_text(json.dumps(manifest | {"decision": {}}))
+    manifest["task"]["decision"] = {}
+    path.write_text(json.dumps(manifest))
     spoilt = qsgm("finetune", "--bundle", own_bundle, toy_paths[0])
     assert_refused(spoilt, 1, "the decision weighs other evidence")
 
@@ -494,7 +496,9 @@ def test_blocks_that_are_none_or_contradict_the_layers_are_a_usage_error(
     assert_refused(qsgm(*command, "--blocks", "4,6"), 2, "--blocks", "expected every layer")
     contradiction = qsgm(*command, "--blocks", "4,5-6", "--layers", 2)
     assert_refused(contradiction, 2, "--blocks", "4,5-6 is 3 layers, but --layers says 2")
-    assert_refused(qsgm("fold-and-quantize", "sgm.pt", "--blocks", "7"), 2, "--blocks")
+    assert_refused(qsgm("fold-and-quantize", "sgm.pt", "--blocks", "6-7,"), 2, "--blocks")
+    # Only the network says how many layers there are.
+    assert_refused(qsgm(*command, "--blocks", "7"), 1, "to layer 6, alone or in ranges")
 
 
 def test_blocks_that_the_bundle_lacks_are_refused_with_those_it_has(
@@ -520,9 +524,9 @@ def test_a_spoilt_bundle_is_refused_in_one_line(
     qsgm: Run, frame_path: Path, own_bundle: Path, tmp_path: Path
 ) -> None:
     command = ("finetune", "--bundle", own_bundle, "-o", tmp_path / "out", frame_path)
-    (own_bundle / trunk_file("float", 3)).write_bytes(b"altered")
+    (own_bundle / trunk_file("float", range(4, 7))).write_bytes(b"altered")
     assert_refused(qsgm(*command), 1, "trunk_float_3.onnx", "qsgm fold-and-quantize")
-    (own_bundle / trunk_file("float", 3)).unlink()
+    (own_bundle / trunk_file("float", range(4, 7))).unlink()
     assert_refused(qsgm(*command), 1, "trunk_float_3.onnx does not exist")
     (own_bundle / "manifest.json").unlink()
     assert_refused(qsgm(*command), 1, "manifest.json")
@@ -635,7 +639,7 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(
         raise KeyboardInterrupt
 
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(finetuning, "tune", interrupted)
+    monkeypatch.setattr(tuning, "run_epochs", interrupted)
     outcome = qsgm("finetune", "--bundle", bundle_folder, "-o", tmp_path / "out", frame_path)
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "interrupted\n")
     assert sorted(tmp_path.rglob("*")) == before
@@ -867,18 +871,18 @@ def test_drawing_a_calibration_set_prints_one_json_object(qsgm: Run, tmp_path: P
 def test_pretrain_passes_on_encoding_and_hidden_channels(
     qsgm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from qsgm.train.pretraining import pretrain
+    from qsgm.train.grasp import pretrain
 
     given = []
-    monkeypatch.setattr(pretrain, "pretrain", lambda *_, **keywords: given.append(keywords))
+    monkeypatch.setattr(pretrain, "pretrain_grasping", lambda *values: given.append(values))
     common = ("pretrain", "--json", "-o", tmp_path / "sgm.pt")
     assert qsgm(*common).json["output"] == str(tmp_path / "sgm.pt")
     assert qsgm(*common, "--encoding", "paper", "--hidden", "16,8").code == 0
-    default, chosen = given
-    assert default["config"] == pretrain.PretrainConfig()
-    assert default["loss"].encoding == "double"
-    assert chosen["config"].hidden == (16, 8)
-    assert chosen["loss"].encoding == "paper"
+    (task, *_, config), (other_task, *_, other_config) = given
+    assert config == pretrain.PretrainConfig()
+    assert task.encoding == "double"
+    assert other_config.hidden == (16, 8)
+    assert other_task.encoding == "paper"
 
 
 @pytest.mark.parametrize("hidden", ["", "a", "8,", "0", "-4,4", "8;8", "99999"])
@@ -891,15 +895,13 @@ def test_defaults_of_the_command_line_are_those_of_the_library(
 ) -> None:
     seen = []
 
-    def stop(
-        frames: list[Path], centers: object, others: object, _: object, settings: object
-    ) -> None:
-        seen.append((frames, centers, others, settings))
+    def stop(frames: list[Path], centers: object, others: object, _: object, *how: object) -> None:
+        seen.append((frames, centers, others, *how))
         raise QsgmError("enough")
 
     monkeypatch.setattr(commands, "_finetune", stop)
     qsgm("finetune", "--bundle", bundle_folder, frame_path)
-    assert seen == [([frame_path], [None], (), Settings())]
+    assert seen == [([frame_path], [None], (), Settings(), None)]
 
 
 def test_an_overlay_without_a_name_is_refused(qsgm: Run, taught: Path, frame_path: Path) -> None:

@@ -88,9 +88,9 @@ def test_the_command_line_starts_without_onnx_runtime_and_opencv() -> None:
 
 
 def test_every_export_is_what_it_says_even_after_its_module_was_imported() -> None:
-    import qsgm.tune.run
+    import qsgm.grasp.teach
 
-    assert qsgm.finetune is qsgm.tune.run.finetune
+    assert qsgm.finetune is qsgm.grasp.teach.finetune
     assert all(getattr(qsgm, name) is not None for name in qsgm.__all__)
     assert not any((Path(qsgm.__file__).parent / f"{name}.py").exists() for name in qsgm.__all__)
     with pytest.raises(AttributeError, match="'qsgm' has no attribute 'nothing'"):

@@ -32,15 +32,15 @@ from qsgm.fidelity import (
     sqnr_db,
     weighted_error,
 )
-from qsgm.grasp.teach import FinetuneResult, finetune
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.teach import FinetuneResult, finetune, prepare_object, train_object, tune_object
 from qsgm.manifest import MANIFEST, probe_file
-from qsgm.schedule import BATCH
+from qsgm.schedule import BATCH, steps_per_epoch
 from qsgm.train.model.local import LayerState, columns, layer_forward
 from qsgm.train.quantization.sgm_fidelity import update_from
 from qsgm.tune import probe as probing
-from qsgm.tune.prepare import STEPS_PER_EPOCH, prepare
+from qsgm.tune.plan import resolve
 from qsgm.tune.report import fidelity_command_json, fidelity_command_report
-from qsgm.tune.run import train
 from qsgm.tune.settings import Settings
 
 RNG = np.random.default_rng(0)
@@ -184,11 +184,11 @@ def test_on_the_host_an_update_is_what_autograd_gives_with_that_gradient_behind_
     state = LayerState.start(torch.randn(1, width, 16) / 9, torch.randn(1, 16))
     for part in (state.weight, state.bias):
         part.requires_grad_()
-    windows = columns(layer, torch.randn(1, 6, positions, 8 if layer == 3 else 16))
-    before, after = layer_forward(layer, state, windows)
+    windows = columns(GRASPNET, layer, torch.randn(1, 6, positions, 8 if layer == 3 else 16))
+    before, after = layer_forward(GRASPNET, layer, state, windows)
     gradient = torch.randn(after.shape)
     expected = torch.autograd.grad((after * gradient).sum() / 6, [state.weight, state.bias])
-    found = update_from(layer, windows, before.detach(), gradient[0].numpy())
+    found = update_from(GRASPNET, layer, windows, before.detach(), gradient[0].numpy())
     flat = torch.cat([part.flatten() for part in expected]).numpy()
     np.testing.assert_allclose(found, flat, atol=1e-4 * np.abs(flat).max())
 
@@ -199,18 +199,19 @@ def result(frame: NDArray[np.uint8], bundle: Bundle) -> FinetuneResult:
 
 
 def test_probes_are_taken_every_so_many_steps_and_once_an_epoch_by_default(
-    result: FinetuneResult,
+    result: FinetuneResult, bundle: Bundle
 ) -> None:
     assert [probe.step for probe in result.probes] == [0, 20, 40]
     assert [probe.epoch for probe in result.probes] == [0, 0.8, 1.6]
-    usual = train(result.prepared, SHORT)
+    usual = tune_object(result.prepared, resolve(SHORT, bundle))
     assert [probe.step for probe in usual.probes] == [0, 25, 50]
-    assert defaults.PROBE_EVERY == STEPS_PER_EPOCH == result.steps / SHORT.epochs == 25
+    an_epoch = steps_per_epoch(result.prepared.taught)
+    assert defaults.PROBE_EVERY == an_epoch == result.steps / SHORT.epochs == 25
     assert usual.probes[0] == result.probes[0]
 
 
 def test_probing_changes_nothing_but_what_it_costs(result: FinetuneResult) -> None:
-    never = train(result.prepared, SHORT, probe=False)
+    never = train_object(result.prepared, resolve(SHORT, result.prepared.bundle))
     assert never.network() == result.network()
     assert (never.losses, never.probes) == (result.losses, ())
 
@@ -218,8 +219,9 @@ def test_probing_changes_nothing_but_what_it_costs(result: FinetuneResult) -> No
 def test_a_run_without_any_distance_between_probes_is_a_programming_error(
     result: FinetuneResult,
 ) -> None:
+    plan = resolve(replace(SHORT, probe_every=0), result.prepared.bundle)
     with pytest.raises(ValueError, match="`probe_every` must be 1 step or more, got 0"):
-        train(result.prepared, replace(SHORT, probe_every=0))
+        tune_object(result.prepared, plan)
 
 
 def test_json_has_every_probe_with_its_step_epoch_and_metrics(result: FinetuneResult) -> None:
@@ -286,17 +288,18 @@ def test_a_bundle_whose_probe_gives_less_is_refused_in_one_line(
     assert "has no output update_true5" in said
     assert "export it again with `qsgm fold-and-quantize`" in said
     assert "\n" not in said
-    assert train(prepare(frame, old, SHORT), replace(SHORT, epochs=0), probe=False).probes == ()
+    plan = resolve(replace(SHORT, epochs=0), old)
+    assert train_object(prepare_object(frame, old, plan), plan).probes == ()
 
 
 def test_a_probe_in_pieces_says_what_a_probe_of_the_whole_batch_says(
     frame: NDArray[np.uint8], bundle: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = Settings(precision="int8", layers=4, epochs=1)
-    prepared = prepare(frame, bundle, settings)
-    pieces = train(prepared, settings).probes
+    plan = resolve(Settings(precision="int8", layers=4, epochs=1), bundle)
+    prepared = prepare_object(frame, bundle, plan)
+    pieces = tune_object(prepared, plan).probes
     monkeypatch.setattr(probing, "PROBE_SLICE", BATCH)
-    for piece, whole in zip(pieces, train(prepared, settings).probes, strict=True):
+    for piece, whole in zip(pieces, tune_object(prepared, plan).probes, strict=True):
         for layer, expected in whole.layers.items():
             found, wanted = asdict(piece.layers[layer]), asdict(expected)
             # Pieces have different numbers of values other than zero, of which this is a share.

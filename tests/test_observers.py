@@ -22,6 +22,8 @@ from qsgm.sgm.ranges import (
     percentile,
 )
 
+# Smallest and largest of a class, a sine and a cosine.
+LABELS = np.float32([0, -1, -1]), np.float32([1, 1, 1])
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 # Everything that float32 holds, and everyday numbers, which bins do not tell apart on their own.
 values_of_two_channels = arrays(
@@ -281,12 +283,12 @@ def test_every_tensor_of_an_sgm_has_its_calibrators_range(name: str, levels: int
     convs = [
         FoldedConv(np.zeros((o, i, 1, 1), np.float32), np.zeros(o, np.float32)) for o, i in shapes
     ]
-    whole, part = (SgmObservers(FoldedSgm(4, tuple(convs))) for _ in range(2))
+    whole, part = (SgmObservers(FoldedSgm(4, (1, 1), tuple(convs))) for _ in range(2))
     inputs = np.concatenate([values, np.full((len(values), 3), 7, np.float32)], axis=1)
     for observers, rows in ((whole, slice(0, 999)), (part, slice(999, None))):
         observers.update(inputs[rows, None], [tensor[rows, None] for tensor in hidden])
     whole.merge(part)
-    ranges = whole.ranges(name, levels)
+    ranges = whole.ranges(name, levels, LABELS)
     low, high = CALIBRATORS[name](observed(values), levels)
     np.testing.assert_array_equal(ranges.input_low, [*low, 0, -1, -1])
     np.testing.assert_array_equal(ranges.input_high, [*high, 1, 1, 1])
@@ -298,7 +300,7 @@ def test_a_run_that_blew_up_widens_ranges_to_eight_times_a_typical_runs_at_most(
     rng = np.random.default_rng(0)
     widths = [(4, 4 + 3, 1, 1), (4, 4, 1, 1)]
     convs = tuple(FoldedConv(np.zeros(w, np.float32), np.zeros(4, np.float32)) for w in widths)
-    sgm = FoldedSgm(4, convs)
+    sgm = FoldedSgm(4, (1, 1), convs)
     total = SgmObservers(sgm)
     highest = np.zeros(4, np.float32)
     for scale in (1.0, 1.2, 500.0, 0.9, 1.1):
@@ -307,12 +309,12 @@ def test_a_run_that_blew_up_widens_ranges_to_eight_times_a_typical_runs_at_most(
         hidden = rng.uniform(0, 2 * scale, (50, 1, 4)).astype(np.float32)
         one.update(seen, [hidden])
         # On its own a run is the typical one.
-        alone = one.ranges("minmax", 256)
+        alone = one.ranges("minmax", 256, LABELS)
         np.testing.assert_array_equal(alone.input_high[:4], seen[..., :4].max(axis=(0, 1)))
         if scale < 2:
             highest = np.maximum(highest, alone.input_high[:4])
         total.merge(one)
-    ranges = total.ranges("minmax", 256)
+    ranges = total.ranges("minmax", 256, LABELS)
     assert (ranges.input_high[:4] >= highest).all()
     assert (ranges.input_high[:4] < 8 * 1.2).all()
     assert (ranges.hidden_high[0] < 8 * 2.4).all()

@@ -10,17 +10,18 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from rich.console import Console
-from toys import by_correlation
+from toys import by_correlation, with_decision
 
 from qsgm import QsgmError, Settings, finetune, load_bundle
 from qsgm.bench.speed import measure_speed
 from qsgm.blocks import one_block, parse_blocks, single_layers
 from qsgm.bundle import Bundle
+from qsgm.grasp.task import distractors_of, task_of
 from qsgm.manifest import probe_file, step_file
 from qsgm.train.graphs.inspection import all_nodes
 from qsgm.train.graphs.memory import step_memory
 from qsgm.train.slim import slim_bundle
-from qsgm.tune.noop_step import random_features, start_of
+from qsgm.tune.prepare import in_step_layout
 
 Frame = NDArray[np.uint8]
 
@@ -47,8 +48,8 @@ def test_tuning_with_it_gives_the_same_bits(
     own, whole = (finetune(frame, one, settings) for one in (slim, bundle))
     for name, weight in whole.weights.items():
         np.testing.assert_array_equal(own.weights[name], weight)
-    assert (own.accuracy, own.losses, own.fidelity) == (
-        whole.accuracy,
+    assert (own.scores, own.losses, own.fidelity) == (
+        whole.scores,
         whole.losses,
         whole.fidelity,
     )
@@ -58,15 +59,15 @@ def test_tuning_with_it_gives_the_same_bits(
 def test_things_and_decision_stay(bundle: Bundle, slim: Bundle, tmp_path: Path) -> None:
     name = "distractors.png"
     assert (slim.folder / name).read_bytes() == (bundle.folder / name).read_bytes()
-    manifest = bundle.manifest | {"decision": by_correlation().to_json()}
-    slim_bundle(replace(bundle, manifest=manifest), parse_blocks("5,6"), tmp_path / "two")
-    decision = load_bundle(tmp_path / "two").decision()
+    deciding = with_decision(bundle, by_correlation())
+    slim_bundle(deciding, parse_blocks("5,6"), tmp_path / "two")
+    decision = task_of(load_bundle(tmp_path / "two")).decision
     assert decision is not None
     assert decision.to_json() == by_correlation().to_json()
-    files = {k: v for k, v in bundle.manifest["files"].items() if k != name}
-    old = replace(bundle, manifest=bundle.manifest | {"files": files})
+    files = {k: v for k, v in bundle.manifest.files.items() if k != name}
+    old = replace(bundle, manifest=replace(bundle.manifest, files=files))
     slim_bundle(old, parse_blocks("5,6"), tmp_path / "old")
-    assert load_bundle(tmp_path / "old").distractors() is None
+    assert distractors_of(load_bundle(tmp_path / "old")) is None
 
 
 @pytest.mark.parametrize(
@@ -92,6 +93,7 @@ def test_what_it_was_made_without_is_refused(
 
 def test_graphs_with_loops_keep_their_arithmetic(bundle: Bundle, tmp_path: Path) -> None:
     text = "1-4,5,6"
+    pixels = np.random.default_rng(0).integers(0, 256, (3, 128 * 128, 3), np.uint8)
     slim_bundle(bundle, parse_blocks(text), tmp_path / "six")
     name, outputs = step_file("int8", "sgd", parse_blocks(text)), []
     for one in (bundle, load_bundle(tmp_path / "six")):
@@ -100,8 +102,9 @@ def test_graphs_with_loops_keep_their_arithmetic(bundle: Bundle, tmp_path: Path)
             value.name: np.full([3 if isinstance(n, str) else n for n in value.shape], 0.1, "f")
             for value in session.get_inputs()
         }
-        feeds |= {"features": random_features(session, 3), "rows": np.arange(3)}
-        outputs.append(session.run(None, feeds | start_of(one, 6)))
+        start = in_step_layout(one.start_weights(one.network.last(6)))
+        feeds |= {"features": pixels, "rows": np.arange(3)}
+        outputs.append(session.run(None, feeds | start))
     for own, whole in zip(*outputs, strict=True):
         np.testing.assert_array_equal(own, whole)
     graph = onnx.load(tmp_path / "six" / name).graph
@@ -136,17 +139,19 @@ def test_what_is_slim_already_stays_as_it_is(bundle: Bundle, tmp_path: Path, tex
 
 def test_a_bundle_may_lack_the_probe_and_nothing_else(bundle: Bundle, tmp_path: Path) -> None:
     blocks = parse_blocks("5,6")
-    files = bundle.manifest["files"]
+    files = bundle.manifest.files
     without = {name: one for name, one in files.items() if name != probe_file(2)}
     report = slim_bundle(
-        replace(bundle, manifest=bundle.manifest | {"files": without}), blocks, tmp_path / "two"
+        replace(bundle, manifest=replace(bundle.manifest, files=without)), blocks, tmp_path / "two"
     )
     assert probe_file(2) not in report.bytes
     step = step_file("float", "sgd", blocks)
     without = {name: one for name, one in files.items() if name != step}
     with pytest.raises(QsgmError, match=f"was made without {step}"):
         slim_bundle(
-            replace(bundle, manifest=bundle.manifest | {"files": without}), blocks, tmp_path / "no"
+            replace(bundle, manifest=replace(bundle.manifest, files=without)),
+            blocks,
+            tmp_path / "no",
         )
 
 
@@ -156,8 +161,8 @@ def test_memory_and_speed_of_a_slim_bundle_are_refused_before_any_work(
     with pytest.raises(QsgmError, match=r"was made without step_float_sgd_4-6\.onnx"):
         measure_speed(frame_path, slim, Settings(), 1, pytest.fail)
     with pytest.raises(QsgmError, match=r"was made without step_float_sgd_4-6\.onnx"):
-        step_memory(slim, "float", one_block(3), 2)
-    assert step_memory(slim, "int8", single_layers(3), 2).peak > 0
+        step_memory(slim, "float", one_block(slim.network.last(3)), 2)
+    assert step_memory(slim, "int8", single_layers(slim.network.last(3)), 2).peak > 0
 
 
 def test_a_bundle_is_not_replaced_by_a_part_of_it(slim: Bundle) -> None:
