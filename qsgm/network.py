@@ -109,12 +109,12 @@ class Network:
         self._check_channels()
         for number, layer in enumerate(self.layers, 1):
             _check_sizes(number, layer)
+        for number, layer in enumerate(self.layers, 1):
             if min(self.after(number)) < 1:
                 raise QsgmError(
                     f"layer {number} has nothing to see: a kernel {layer.kernel} with a pool "
                     f"{layer.pool} on maps of {self.before(number)}"
                 )
-
         if area(self.after(self.depth)) != 1:
             raise QsgmError(
                 f"the last layer gives maps of {self.after(self.depth)}, expected one position: "
@@ -188,7 +188,10 @@ class Network:
         return {
             "input_shape": list(self.input_shape),
             "input_kind": self.input_kind,
-            "layers": [asdict(layer) for layer in self.layers],
+            "layers": [
+                {name: _plain(value) for name, value in asdict(layer).items()}
+                for layer in self.layers
+            ],
         }
 
     @staticmethod
@@ -242,6 +245,11 @@ def _check_sizes(number: int, layer: Layer) -> None:
             f"layer {number} is padded by {layer.padding}, expected less than its kernel "
             f"{layer.kernel}"
         )
+
+
+def _plain(value: Any) -> Any:
+    """A pair as JSON has it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _layer_from(values: Any) -> Layer:

@@ -8,6 +8,7 @@ an activation, so that they need a known range, which the activation has.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from math import inf
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -50,7 +51,7 @@ class Head:
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS.get(self.kind, ()):
             raise QsgmError(f"head {self.name!r}: {self.kind} with {self.activation} is no loss")
-        if not (self.channels >= 1 and self.weight > 0 and 0 <= self.smoothing < 1):
+        if not (self.channels >= 1 and 0 < self.weight < inf and 0 <= self.smoothing < 1):
             raise QsgmError(
                 f"head {self.name!r}: expected a channel or more, a positive weight and smoothing "
                 f"in [0, 1), got {self.channels}, {self.weight:g}, {self.smoothing:g}"
@@ -86,7 +87,7 @@ def heads_from_json(values: Any) -> Heads:
     """Read heads from plain values, trusting nothing in them. Raises QsgmError."""
     try:
         heads = tuple(_head_from(one) for one in values)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise QsgmError(f"this is no description of output heads ({error})") from error
     total = output_count(heads)
     if not heads or any(head.where is not None and head.where >= total for head in heads):
@@ -188,5 +189,8 @@ def _head_from(values: Any) -> Head:
     whole = (values["channels"], 0 if where is None else where)
     if not all(type(value) is int and value >= 0 for value in whole):
         raise TypeError("`channels` and `where` are whole numbers")
-    numbers = float(values["weight"]), float(values["smoothing"])
-    return Head(values["name"], kind, values["channels"], activation, *numbers, where)
+    numbers = values["weight"], values["smoothing"]
+    if not all(type(value) in (int, float) for value in numbers):
+        raise TypeError("`weight` and `smoothing` are numbers")
+    weight, smoothing = map(float, numbers)
+    return Head(values["name"], kind, values["channels"], activation, weight, smoothing, where)

@@ -22,7 +22,8 @@ from qsgm.grasp.teach import finetune
 from qsgm.manifest import NETWORK, Recipe, head_file, probe_file, step_file, trunk_file
 from qsgm.tune.settings import Settings
 
-BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", "4,5-6", "1-4,5,6"]
+GROUPED = ("4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6")
+BLOCKS = ["6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6", *GROUPED]
 LAST_TWO, LAST_THREE = GRASPNET.last(2), GRASPNET.last(3)
 STEP = step_file("float", "sgd", parse_blocks("4,5,6"))
 
@@ -35,7 +36,7 @@ def test_a_whole_bundle_loads(bundle: Bundle) -> None:
     assert bundle.manifest.heads == task.heads
     assert bundle.manifest.most_layers == 6
     singles = ("6", "5,6", "4,5,6", "3,4,5,6", "2,3,4,5,6", "1,2,3,4,5,6")
-    assert bundle.manifest.blocks == (*singles, "4,5-6", "1-4,5,6")
+    assert bundle.manifest.blocks == (*singles, *GROUPED)
 
 
 def test_the_things_that_come_with_a_bundle_are_read_and_checked(

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from qsgm.bundle import Bundle
+from qsgm.errors import QsgmError
 from qsgm.manifest import COMMAND
 from qsgm.progress import Progress
 from qsgm.runtime import running
@@ -61,8 +62,15 @@ class StreamedFeatures:
     ) -> None:
         self._lesson, self._bundle, self._seconds = lesson, bundle, seconds
         self._session = bundle.session(plan.trunk_file, plan.settings.threads)
-        (self._input,) = (value.name for value in self._session.get_inputs())
-        (output,) = self._session.get_outputs()
+        takes = [value.name for value in self._session.get_inputs()]
+        output, *others = self._session.get_outputs()
+        gives = [value.name for value in (output, *others)]
+        if (takes, gives) != (["samples"], ["features"]):
+            raise QsgmError(
+                f"{plan.trunk_file} of the bundle {bundle.folder} does not fit: it takes {takes} "
+                f"and gives {gives}, expected samples and their features; export it again with "
+                f"`{COMMAND}`"
+            )
         self._shape = tuple(output.shape[1:])
         self._dtype = np.dtype(np.uint8 if "uint8" in output.type else np.float32)
 
@@ -74,7 +82,7 @@ class StreamedFeatures:
             with _adding_to(self._seconds, "crops"):
                 inputs = self._lesson.cut(rows[some])
             with _adding_to(self._seconds, "features"), running_graphs(self._bundle):
-                features[some] = self._session.run(["features"], {self._input: inputs})[0]
+                features[some] = self._session.run(["features"], {"samples": inputs})[0]
             if watch is not None:
                 watch("crops", some.stop, len(rows))
         return features
