@@ -3,20 +3,26 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from command_line import Outcome, Run
 from hypothesis import settings
 from numpy.typing import NDArray
 from torch import nn
+from toys import lay, table, toy
 
+from qsgm import cli
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle, load_bundle
+from qsgm.grasp import teach
 from qsgm.grasp.crops import cut_crops, plan_crops
 from qsgm.grasp.distractors import FILE as DISTRACTORS
+from qsgm.grasp.lesson import GraspLesson
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.images import write_png
@@ -95,6 +101,50 @@ def frames_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def frame_path(frames_folder: Path) -> Path:
     return frames_folder / "bar.png"
+
+
+@pytest.fixture
+def few_crops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers 1 to 3 see large maps."""
+    monkeypatch.setattr(teach, "GraspLesson", partial(GraspLesson, taught=64))
+    monkeypatch.setattr(teach, "crop_source", partial(crop_source, count=96))
+
+
+@pytest.fixture
+def qsgm(capsys: pytest.CaptureFixture[str]) -> Run:
+    """The command line in this process."""
+
+    def run(*arguments: object) -> Outcome:
+        code = cli.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(code, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture
+def taught(qsgm: Run, frame_path: Path, bundle_folder: Path, tmp_path: Path) -> Path:
+    """An object that the command line tuned."""
+    folder = tmp_path / "taught"
+    outcome = qsgm(
+        "finetune", "--epochs", 1, "--bundle", bundle_folder, "-o", folder, "--json", frame_path
+    )
+    assert outcome.code == 0, outcome.err
+    return folder
+
+
+@pytest.fixture
+def toy_paths(tmp_path: Path) -> list[Path]:
+    """A toy, the same one turned on another table, and another thing."""
+    frames = [
+        lay(toy(), table(), (320.0, 240.0)),
+        lay(toy(), table(1), (260.0, 200.0), 70),
+        lay(toy()[..., [2, 1, 0, 3]], table(2), (320.0, 240.0)),
+    ]
+    paths = [tmp_path / f"{name}.png" for name in ("toy", "turned", "other")]
+    for path, frame in zip(paths, frames, strict=True):
+        cv2.imwrite(str(path), frame)
+    return paths
 
 
 @pytest.fixture(autouse=True)

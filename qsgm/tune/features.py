@@ -67,9 +67,9 @@ class StreamedFeatures:
         gives = [value.name for value in (output, *others)]
         if (takes, gives) != (["samples"], ["features"]):
             raise QsgmError(
-                f"{plan.trunk_file} of the bundle {bundle.folder} does not fit: it takes {takes} "
-                f"and gives {gives}, expected samples and their features; export it again with "
-                f"`{COMMAND}`"
+                f"{plan.trunk_file} of the bundle {bundle.folder} does not fit its name: it takes "
+                f"{takes} and gives {gives}, expected samples and their features; export it again "
+                f"with `{COMMAND}`"
             )
         self._shape = tuple(output.shape[1:])
         self._dtype = np.dtype(np.uint8 if "uint8" in output.type else np.float32)

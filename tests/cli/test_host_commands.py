@@ -1,0 +1,55 @@
+"""The host's commands pass on what they are given, and say what is missing."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from command_line import Run, assert_refused
+
+from qsgm.cli import console
+
+
+def test_host_commands_say_what_to_install_when_torch_is_missing(
+    qsgm: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_torch(_: str) -> None:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
+
+    monkeypatch.setattr(console, "importlib", SimpleNamespace(import_module=without_torch))
+    for command in (("pretrain",), ("fold-and-quantize", "sgm.pt")):
+        assert_refused(
+            qsgm(*command), 1, "needs torch", "pip install -c constraints.txt '.[train]'"
+        )
+
+
+def test_speed_needs_a_step_to_time(qsgm: Run) -> None:
+    assert_refused(qsgm("bench", "speed", "--epochs", 0), 2, "--epochs")
+
+
+def test_drawing_a_calibration_set_prints_one_json_object(qsgm: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "calib"
+    outcome = qsgm("draw-calibration", "--count", 1, "--seed", 3, "-o", folder, "--json")
+    assert outcome.json == {"output": str(folder), "frames": 1, "seed": 3}
+    assert (folder / "frame_00.jpg").is_file()
+
+
+def test_pretrain_passes_on_encoding_and_hidden_channels(
+    qsgm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from qsgm.train.grasp import pretrain
+
+    given = []
+    monkeypatch.setattr(pretrain, "pretrain_grasping", lambda *values: given.append(values))
+    common = ("pretrain", "--json", "-o", tmp_path / "sgm.pt")
+    assert qsgm(*common).json["output"] == str(tmp_path / "sgm.pt")
+    assert qsgm(*common, "--encoding", "paper", "--hidden", "16,8").code == 0
+    (task, *_, config), (other_task, *_, other_config) = given
+    assert config == pretrain.PretrainConfig()
+    assert task.encoding == "double"
+    assert other_config.hidden == (16, 8)
+    assert other_task.encoding == "paper"
+
+
+@pytest.mark.parametrize("hidden", ["", "a", "8,", "0", "-4,4", "8;8", "99999"])
+def test_hidden_channels_that_are_none_are_a_usage_error(qsgm: Run, hidden: str) -> None:
+    assert_refused(qsgm("pretrain", "--hidden", hidden), 2, "--hidden")
