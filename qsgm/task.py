@@ -51,7 +51,8 @@ class Head:
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS.get(self.kind, ()):
             raise QsgmError(f"head {self.name!r}: {self.kind} with {self.activation} is no loss")
-        if not (self.channels >= 1 and 0 < self.weight < inf and 0 <= self.smoothing < 1):
+        positive = 0 < self.weight < inf
+        if not (self.channels >= 1 and positive and 0 <= self.smoothing < 1):
             raise QsgmError(
                 f"head {self.name!r}: expected a channel or more, a positive weight and smoothing "
                 f"in [0, 1), got {self.channels}, {self.weight:g}, {self.smoothing:g}"

@@ -130,7 +130,7 @@ def test_a_key_that_holds_something_else_is_refused_by_its_name(
     "name",
     [
         *("", ".", "..", "/", "/etc/passwd", "../network.onnx", "a/b", "a/", "./network.onnx"),
-        *("a\\b", "C:network.onnx", "a\nb", "a\0b", "\x1b[2J"),
+        *("a\\b", "a\nb", "a\0b", "\x1b[2J"),
     ],
 )
 def test_names_that_are_not_plain_are_refused(

@@ -16,9 +16,7 @@ from qsgm.grasp.lesson import GraspLabels, Orientation
 from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import distractors_of
-from qsgm.grasp.teach import (
-    FinetuneResult,
-)
+from qsgm.grasp.teach import FinetuneResult
 from qsgm.manifest import head_file
 from qsgm.weights import to_step_layout
 

@@ -17,9 +17,7 @@ from qsgm.grasp.others import other_in
 from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import Demonstration
 from qsgm.grasp.task import distractors_of
-from qsgm.grasp.teach import (
-    FinetuneResult,
-)
+from qsgm.grasp.teach import FinetuneResult
 from qsgm.grasp.tuned import MARGIN_PX
 
 

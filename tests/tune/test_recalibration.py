@@ -32,13 +32,7 @@ from qsgm.train.graphs.sgm import int8_sgm
 from qsgm.train.graphs.sharing import SharedConstants
 from qsgm.tune.plan import resolve
 from qsgm.tune.probe import constants_of
-from qsgm.tune.recalibrate import (
-    activations_before,
-    grown,
-    ranges_of,
-    recalibrated,
-    typical_labels,
-)
+from qsgm.tune.recalibrate import activations_before, grown, ranges_of, recalibrated, typical_labels
 from qsgm.tune.settings import Settings
 
 Frame = NDArray[np.uint8]
