@@ -44,11 +44,14 @@ def test_an_object_at_the_border_is_taught_with_its_frame_continued(
     assert shown.center_px == (96.0, 240.0)
 
 
-def test_what_is_no_frame_is_a_programming_error(frame: Frame, bundle: Bundle) -> None:
-    with pytest.raises(ValueError, match=r"`frame` must be uint8 \(H, W, 3\), got float64"):
-        finetune(frame / 255.0, bundle)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="`frame` must be"):
-        finetune(frame[:, :, 0], bundle)
+def test_what_is_no_frame_is_refused_in_one_line(frame: Frame, bundle: Bundle) -> None:
+    for bad, got in ((frame / 255.0, "float64"), (frame[:, :, 0], "uint8")):
+        with pytest.raises(
+            QsgmError, match=rf"the frame is an array of {got} \(480, 640"
+        ) as raised:
+            finetune(bad, bundle)
+        assert "expected a numpy array of uint8 (height, width, 3)" in str(raised.value)
+        assert "\n" not in str(raised.value)
 
 
 def toy_frame(turn_deg: float = 0.0, seed: int = 0) -> Frame:
