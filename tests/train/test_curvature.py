@@ -2,26 +2,27 @@
 
 import torch
 
+from qsgm.grasp.network import GRASPNET
 from qsgm.train.model.curvature import Curvature
 from qsgm.train.model.local import LayerState, local_step
 
 
 def random_curvature(layer: int, seed: int = 0) -> Curvature:
     generator = torch.Generator().manual_seed(seed)
-    matrices = Curvature.identity(layer).matrices
+    matrices = Curvature.identity(GRASPNET.layer(layer)).matrices
     return Curvature(*(torch.randn(m.shape, generator=generator) for m in matrices))
 
 
 def test_the_identity_bends_nothing() -> None:
     d_weight, d_bias = torch.randn(2, 400, 16), torch.randn(2, 16)
-    bent = Curvature.identity(4).bend(d_weight, d_bias)
+    bent = Curvature.identity(GRASPNET.layer(4)).precondition(d_weight, d_bias)
     torch.testing.assert_close(bent, (d_weight, d_bias))
 
 
 def test_each_matrix_multiplies_its_own_axis_of_the_gradient() -> None:
     curvature = random_curvature(4)
     d_weight, d_bias = torch.randn(2, 400, 16), torch.randn(2, 16)
-    weight, bias = curvature.bend(d_weight, d_bias)
+    weight, bias = curvature.precondition(d_weight, d_bias)
     # One matrix for the whole weight: K is ordered (window, input channel).
     whole = torch.kron(curvature.window, curvature.into)
     expected = whole.T @ d_weight @ curvature.out
@@ -38,8 +39,10 @@ def test_a_local_step_descends_along_the_bent_gradient() -> None:
     def gradient_of(_: int, activation: torch.Tensor, __: torch.Tensor) -> torch.Tensor:
         return activation.cos()
 
-    (plain,) = local_step([state], features, labels, rate, gradient_of, 0.9)
-    (bent,) = local_step([state], features, labels, rate, gradient_of, 0.9, {6: curvature})
-    expected = curvature.bend(plain.weight_momentum, plain.bias_momentum)
+    (plain,) = local_step(GRASPNET, [state], features, labels, rate, gradient_of, 0.9)
+    (bent,) = local_step(
+        GRASPNET, [state], features, labels, rate, gradient_of, 0.9, {6: curvature}
+    )
+    expected = curvature.precondition(plain.weight_momentum, plain.bias_momentum)
     torch.testing.assert_close((bent.weight_momentum, bent.bias_momentum), expected)
     torch.testing.assert_close(bent.weight, state.weight - 0.1 * expected[0])

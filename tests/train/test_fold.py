@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from qsgm.train.model.graspnet import CHANNELS
 from torch import nn
 from torch.nn import functional as F
 
@@ -11,7 +10,7 @@ from qsgm import QsgmError
 from qsgm.grasp.network import GRASPNET
 from qsgm.train.model.arrays import on_pixels
 from qsgm.train.model.fold import fold_net, fold_sgm, net_fold_error, run_folded, sgm_fold_error
-from qsgm.train.model.net import ConvNet, normalize
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.model.sgm import Sgm
 
 
@@ -44,7 +43,7 @@ def random_crops(seed: int, count: int = 4) -> torch.Tensor:
 def test_folded_network_equals_the_unfolded_one(seed: int) -> None:
     net, crops = shaken_net(seed), random_crops(seed)
     with torch.no_grad():
-        expected = net(normalize(crops))
+        expected = net(as_seen(GRASPNET, crops))
         got = run_folded(fold_net(net), crops)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
     assert net_fold_error(net, fold_net(net), crops) == float((got - expected).abs().max())
@@ -61,7 +60,7 @@ def test_the_first_layer_can_take_raw_pixels(seed: int) -> None:
     )
     got = F.relu(F.conv2d(crops.permute(0, 3, 1, 2).float(), weight, bias, stride=2))
     with torch.no_grad():
-        expected = net.between(normalize(crops), 1, 1)
+        expected = net.between(as_seen(GRASPNET, crops), 1, 1)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=2e-5)
 
 
@@ -69,9 +68,9 @@ def test_the_first_layer_can_take_raw_pixels(seed: int) -> None:
 @pytest.mark.parametrize("hidden", [None, (7,), (9, 6), (5, 8, 4)])
 def test_folded_sgm_equals_the_unfolded_one(layer: int, hidden: tuple[int, ...] | None) -> None:
     torch.manual_seed(layer)
-    sgm = Sgm(layer, hidden)
+    sgm = Sgm(GRASPNET, layer, hidden)
     shake_norms(sgm, layer)
-    activation, labels = 3 * torch.randn(8, CHANNELS[layer], 5, 5), torch.randn(8, 3)
+    activation, labels = 3 * torch.randn(8, GRASPNET.layer(layer).out, 5, 5), torch.randn(8, 3)
     folded = fold_sgm(sgm)
     assert folded.layer == layer
     assert len(folded.convs) == len(sgm.hidden) + 1
@@ -97,9 +96,11 @@ def test_parameter_counts_are_the_papers() -> None:
 
 def test_folded_layers_keep_geometry_and_drop_two_numbers_per_channel() -> None:
     folded = fold_net(ConvNet(GRASPNET))
-    assert [layer.stride for layer in folded.layers] == [2, 2, 2, 2, 1, 1]
-    assert [layer.relu for layer in folded.layers] == [True] * 5 + [False]
-    assert [layer.pool for layer in folded.layers] == [1, 1, 1, 5, 1, 1]
+    geometry = folded.network.layers
+    assert [layer.stride for layer in geometry] == [(2, 2)] * 4 + [(1, 1)] * 2
+    assert [layer.padding for layer in geometry] == [(0, 0)] * 6
+    assert [layer.relu for layer in geometry] == [True] * 5 + [False]
+    assert [layer.pool for layer in geometry] == [(1, 1)] * 3 + [(5, 5)] + [(1, 1)] * 2
     sizes = [layer.weight.size + layer.bias.size for layer in folded.layers]
     assert sizes == [624 - 16, 1624 - 16, 3248 - 32, 6448 - 32, 304 - 32, 51]
     assert all(layer.weight.dtype == layer.bias.dtype == np.float32 for layer in folded.layers)

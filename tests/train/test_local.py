@@ -6,11 +6,13 @@ some wrong ways do, and by how much is up to the CPU.
 
 import pytest
 import torch
+from losses import GraspLoss
 from torch import Tensor
 from torch.nn import functional as F
 
-from qsgm.grasp.task import GraspTask
-from qsgm.train.model.local import LayerState, error, local_step, outputs, true_gradients
+from qsgm.grasp.network import GRASPNET
+from qsgm.train.heads import error
+from qsgm.train.model.local import LayerState, local_step, outputs, true_gradients
 
 TASKS, BATCH = 3, 5
 SHAPES = {
@@ -23,7 +25,7 @@ SHAPES = {
 }
 SIDE = {1: 128, 2: 62, 3: 29, 4: 13, 5: 1, 6: 1}  # of the map that a layer sees of a crop
 RATES = {1: 0.01, 2: 0.02, 3: 0.03, 4: 0.1, 5: 0.2, 6: 0.3}
-LOSSES = [GraspTask(), GraspTask("paper", label_smoothing=0.0, angle_weight=2.0)]
+LOSSES = [GraspLoss(), GraspLoss("paper", label_smoothing=0.0, angle_weight=2.0)]
 
 DTYPE = torch.float64
 ROUNDING = 1e-12  # of the largest entry
@@ -100,16 +102,16 @@ def flat_gradients(number: int, weights: Weights, objective: Tensor) -> tuple[Te
 def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> None:
     tasks, (features, labels) = random_weights(tuned), random_data(tuned)
     states = as_states(tasks)
-    loss = GraspTask()
+    loss = GraspLoss()
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
-            return error(loss, activation, labels[:, :, None])
+            return error(loss.heads, activation, labels[:, :, None])
         return made_up_gradient(layer, activation, labels)
 
     rates = [torch.tensor(RATES[number], dtype=DTYPE) for number in tasks[0]]
-    updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
-    twice = local_step(updated, features, labels, rates, gradient_of, momentum=0.9)
+    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of, momentum=0.9)
+    twice = local_step(GRASPNET, updated, features, labels, rates, gradient_of, momentum=0.9)
     for task, weights in enumerate(tasks):
         x = as_map(features[task])
         for index, number in enumerate(weights):
@@ -130,7 +132,7 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
             assert_equal(once.bias[task], before.bias[task] - RATES[number] * bias)
     # The second step is a first one from there, but for the momentum, which remembers.
     forgetful = [LayerState.start(once.weight, once.bias) for once in updated]
-    fresh = local_step(forgetful, features, labels, rates, gradient_of, momentum=0.9)
+    fresh = local_step(GRASPNET, forgetful, features, labels, rates, gradient_of, momentum=0.9)
     for rate, once, anew, second in zip(rates, updated, fresh, twice, strict=True):
         momentum = 0.9 * once.weight_momentum + anew.weight_momentum
         assert_equal(second.weight_momentum, momentum)
@@ -143,7 +145,7 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
 @pytest.mark.parametrize("tuned", range(1, 7))
 def test_outputs_equal_plain_convolutions(tuned: int) -> None:
     tasks, (features, _) = random_weights(tuned), random_data(tuned)
-    got = outputs(as_states(tasks), features)
+    got = outputs(GRASPNET, as_states(tasks), features)
     for task, weights in enumerate(tasks):
         x = as_map(features[task])
         for number in weights:
@@ -152,19 +154,19 @@ def test_outputs_equal_plain_convolutions(tuned: int) -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
-def test_loss_gradient_equals_autograd(loss: Loss) -> None:
+def test_loss_gradient_equals_autograd(loss: GraspLoss) -> None:
     torch.manual_seed(0)
     raw = (3 * normal(50, 3)).requires_grad_()
     labels = torch.rand(50, 3, dtype=DTYPE).round()
     (expected,) = torch.autograd.grad(loss.per_sample(raw, labels).sum(), raw)
-    assert_equal(error(loss, raw.detach(), labels), expected)
+    assert_equal(error(loss.heads, raw.detach(), labels), expected)
 
 
 @pytest.mark.parametrize("tuned", range(1, 7))
 @pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
-def test_true_gradients_equal_autograd(tuned: int, loss: Loss) -> None:
+def test_true_gradients_equal_autograd(tuned: int, loss: GraspLoss) -> None:
     tasks, (features, labels) = random_weights(tuned), random_data(tuned)
-    got = true_gradients(as_states(tasks), features, labels, loss)
+    got = true_gradients(GRASPNET, as_states(tasks), features, labels, loss.heads)
     assert set(got) == set(tasks[0])
     for task, weights in enumerate(tasks):
         x, activations = as_map(features[task]).requires_grad_(), {}
@@ -184,12 +186,12 @@ def test_meta_gradients_flow_through_a_step() -> None:
 
     def gradient_of(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         if layer == 6:
-            return error(GraspTask(), activation, labels[:, :, None])
+            return error(GraspLoss().heads, activation, labels[:, :, None])
         return scale[0] * made_up_gradient(layer, activation, labels)
 
     rates = [scale[1] * 0.1, torch.tensor(0.1, dtype=DTYPE)]
-    updated = local_step(states, features, labels, rates, gradient_of, momentum=0.9)
-    raw = outputs(updated, features)
-    GraspTask()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
+    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of, momentum=0.9)
+    raw = outputs(GRASPNET, updated, features)
+    GraspLoss()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
     assert scale.grad is not None
     assert (scale.grad != 0).all()

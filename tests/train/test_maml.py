@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import GraspTask
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, Run, _Unrolled, apply_sgm
@@ -39,7 +40,7 @@ def tiny_training(
         (torch.randn(16, 16) * 0.3, torch.full((16,), 0.1)),
         (torch.randn(16, 3) * 0.3, torch.zeros(3)),
     ]
-    sgms = {layer: Sgm(layer, (8,)) for layer in (4, 5)}
+    sgms = {layer: Sgm(GRASPNET, layer, (8,)) for layer in (4, 5)}
     return MetaTraining(config, GraspTask(), tiny_tasks(), start, sgms, rates, seed)
 
 
@@ -79,7 +80,7 @@ def test_the_meta_gradient_equals_finite_differences_through_the_whole_unrolled_
 
 def test_an_sgm_gives_every_task_what_it_gives_that_task_alone() -> None:
     torch.manual_seed(0)
-    sgm = Sgm(4, (8,)).eval()
+    sgm = Sgm(GRASPNET, 4, (8,)).eval()
     activation, labels = torch.rand(3, 5, 1, 16), torch.rand(3, 5, 3)
     together = apply_sgm(sgm, activation, labels)
     for task in range(3):
@@ -89,12 +90,12 @@ def test_an_sgm_gives_every_task_what_it_gives_that_task_alone() -> None:
 
 def test_a_map_with_many_positions_keeps_its_order() -> None:
     torch.manual_seed(0)
-    sgm = Sgm(3, (4,)).eval()
-    activation, labels = torch.rand(2, 3, 25, 16), torch.rand(2, 3, 3)
-    maps = activation[1, 2].T.reshape(1, 16, 5, 5)
+    sgm = Sgm(GRASPNET, 3, (4,)).eval()
+    activation, labels = torch.rand(2, 3, 169, 16), torch.rand(2, 3, 3)
+    maps = activation[1, 2].T.reshape(1, 16, 13, 13)
     alone = sgm(maps, labels[1, 2][None])[0]
     together = apply_sgm(sgm, activation, labels)[1, 2]
-    torch.testing.assert_close(together, alone.reshape(16, 25).T)
+    torch.testing.assert_close(together, alone.reshape(16, 169).T)
 
 
 def test_outer_steps_change_sgms_start_and_rates_and_lower_the_query_loss() -> None:

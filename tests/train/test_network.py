@@ -5,18 +5,20 @@ import onnx
 import onnxruntime as ort
 import pytest
 import torch
+from losses import GraspLoss
 from nets import random_net
 
 from qsgm import QsgmError
 from qsgm.grasp.angles import AngleEncoding
 from qsgm.grasp.network import GRASPNET
-from qsgm.grasp.task import GraspTask
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
 from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.fold import fold_net
-from qsgm.train.model.net import ConvNet, normalize
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.weights import to_conv_layout, to_step_layout
+
+HEADS = GraspLoss().heads
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,7 @@ def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray
     for number in range(7 - tuned, 7):
         feeds[f"weight{number}"] = to_step_layout(net.layers[number - 1].weight)
         feeds[f"bias{number}"] = net.layers[number - 1].bias
-    return run(head_model(net, tuned, "double").SerializeToString(), **feeds)
+    return run(head_model(net, tuned, HEADS).SerializeToString(), **feeds)
 
 
 @pytest.mark.parametrize(
@@ -50,9 +52,9 @@ def head_outputs(net: FoldedNet, features: np.ndarray, tuned: int) -> np.ndarray
 )
 def test_trunk_equals_torch(net: ConvNet, last_frozen: int, positions: int, channels: int) -> None:
     crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
-    got = run(trunk_model(fold_net(net), last_frozen).SerializeToString(), crops=crops)
+    got = run(trunk_model(fold_net(net), last_frozen).SerializeToString(), samples=crops)
     with torch.no_grad():
-        maps = net.between(normalize(torch.tensor(crops)), 1, last_frozen)
+        maps = net.between(as_seen(GRASPNET, torch.tensor(crops)), 1, last_frozen)
     assert got.shape == (5, positions, channels)
     expected = maps.flatten(2).transpose(1, 2).numpy()
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
@@ -62,17 +64,19 @@ def test_trunk_equals_torch(net: ConvNet, last_frozen: int, positions: int, chan
 def test_network_on_a_frame_equals_torch(
     net: ConvNet, frame: np.ndarray, encoding: AngleEncoding
 ) -> None:
-    got = run(network_model(fold_net(net), encoding).SerializeToString(), frame=frame)
+    got = run(
+        network_model(fold_net(net), GraspLoss(encoding).heads).SerializeToString(), frame=frame
+    )
     with torch.no_grad():
-        raw = net(normalize(torch.tensor(frame)[None]))
+        raw = net(as_seen(GRASPNET, torch.tensor(frame)[None]))
     assert got.shape == (3, 23, 33)
-    expected = GraspTask(encoding).activate(raw)[0].numpy()
+    expected = GraspLoss(encoding).activate(raw)[0].numpy()
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_where_nothing_is_frozen_the_trunk_leaves_pixels_as_they_are(net: ConvNet) -> None:
     crops = np.random.default_rng(1).integers(0, 256, (5, 128, 128, 3), dtype=np.uint8)
-    got = run(trunk_model(fold_net(net), 0).SerializeToString(), crops=crops)
+    got = run(trunk_model(fold_net(net), 0).SerializeToString(), samples=crops)
     assert got.dtype == np.uint8
     np.testing.assert_array_equal(got, crops.reshape(5, 128 * 128, 3))
 
@@ -82,17 +86,17 @@ def test_every_cell_equals_trunk_and_head_on_its_window(
     net: ConvNet, frame: np.ndarray, tuned: int
 ) -> None:
     folded = fold_net(net)
-    heatmap = run(network_model(folded, "double").SerializeToString(), frame=frame)
+    heatmap = run(network_model(folded, HEADS).SerializeToString(), frame=frame)
     cells = [(row, col) for row in range(0, 23, 11) for col in range(0, 33, 8)]
     windows = [frame[16 * row :][:128, 16 * col :][:, :128] for row, col in cells]
     trunk = trunk_model(folded, 6 - tuned).SerializeToString()
-    got = head_outputs(folded, run(trunk, crops=np.stack(windows)), tuned)
+    got = head_outputs(folded, run(trunk, samples=np.stack(windows)), tuned)
     rows, cols = np.transpose(cells)
     np.testing.assert_allclose(got, heatmap[:, rows, cols].T, rtol=1e-5, atol=1e-5)
 
 
 def test_network_takes_frames_of_other_sizes(net: ConvNet) -> None:
-    model = network_model(fold_net(net), "double").SerializeToString()
+    model = network_model(fold_net(net), HEADS).SerializeToString()
     assert run(model, frame=np.zeros((128, 128, 3), np.uint8)).shape == (3, 1, 1)
     assert run(model, frame=np.zeros((144, 200, 3), np.uint8)).shape == (3, 2, 5)
 
@@ -100,7 +104,7 @@ def test_network_takes_frames_of_other_sizes(net: ConvNet) -> None:
 def test_patching_bytes_in_the_file_makes_the_tuned_network(
     net: ConvNet, frame: np.ndarray
 ) -> None:
-    data = network_model(fold_net(net), "double").SerializeToString()
+    data = network_model(fold_net(net), HEADS).SerializeToString()
     torch.manual_seed(1)
     tuned = ConvNet(GRASPNET).eval()
     for number in (1, 2, 3):
@@ -113,7 +117,7 @@ def test_patching_bytes_in_the_file_makes_the_tuned_network(
             start, size = offsets[name]
             assert size == array.nbytes
             patched[start : start + size] = array.astype("<f4").tobytes()
-    expected = network_model(fold_net(tuned), "double")
+    expected = network_model(fold_net(tuned), HEADS)
     onnx.checker.check_model(onnx.load_model_from_string(bytes(patched)), full_check=True)
     assert bytes(patched) == expected.SerializeToString()
     heatmap = run(expected.SerializeToString(), frame=frame)
@@ -124,7 +128,7 @@ def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: C
     folded = fold_net(net)
     for layer in folded.layers[3:5]:
         layer.bias[:] = 0
-    data = network_model(folded, "double").SerializeToString()
+    data = network_model(folded, HEADS).SerializeToString()
     offsets = initializer_offsets(data)
     model = onnx.load_model_from_string(data)
     assert offsets["bias4"] != offsets["bias5"]
@@ -137,14 +141,14 @@ def test_offsets_are_found_even_where_two_initializers_hold_equal_numbers(net: C
 def test_weights_survive_the_way_into_the_steps_layout_and_back(net: ConvNet, layer: int) -> None:
     weight = fold_net(net).layers[layer - 1].weight
     windows = to_step_layout(weight)
-    out, into, kernel, _ = weight.shape
-    assert windows.shape == (out, kernel * kernel * into)
+    out, into, *kernel = weight.shape
+    assert windows.shape == (out, kernel[0] * kernel[1] * into)
     np.testing.assert_array_equal(windows[:, :into], weight[:, :, 0, 0])
-    np.testing.assert_array_equal(to_conv_layout(windows, kernel), weight)
+    np.testing.assert_array_equal(to_conv_layout(windows, (kernel[0], kernel[1])), weight)
 
 
 def test_initializers_outside_raw_data_are_refused(net: ConvNet) -> None:
-    model = network_model(fold_net(net), "double")
+    model = network_model(fold_net(net), HEADS)
     tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "bias6")
     tensor.ClearField("raw_data")
     tensor.float_data.extend([1.0, 2.0, 3.0])

@@ -2,14 +2,16 @@
 
 import pytest
 import torch
-from qsgm.train.model.graspnet import CHANNELS
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qsgm.grasp.network import GRASPNET
 from qsgm.train.model.local import LayerState, local_step
-from qsgm.train.model.sgm import SGM_LAYERS, Sgm, SgmLayer, Teacher
+from qsgm.train.model.sgm import Sgm, SgmLayer, Teacher
 
 BATCH, LAYER = 6, 5
+SGM_LAYERS = range(1, 6)
+CHANNELS = GRASPNET.layer(LAYER).out
 
 
 class Case:
@@ -17,8 +19,8 @@ class Case:
 
     def __init__(self, hidden: tuple[int, ...] | None = (12, 9)) -> None:
         torch.manual_seed(0)
-        self.conv, self.rest = nn.Conv2d(4, CHANNELS[LAYER], 3), nn.Conv2d(CHANNELS[LAYER], 2, 1)
-        self.sgm = Sgm(LAYER, hidden).eval()
+        self.conv, self.rest = nn.Conv2d(4, CHANNELS, 3), nn.Conv2d(CHANNELS, 2, 1)
+        self.sgm = Sgm(GRASPNET, LAYER, hidden).eval()
         self.x, self.labels = torch.randn(BATCH, 4, 5, 5), torch.randn(BATCH, 3)
         self.told: list[tuple[Tensor, Tensor]] = []
 
@@ -37,21 +39,21 @@ def gradients(module: nn.Module) -> list[Tensor | None]:
 
 
 def test_parameter_counts_are_the_papers() -> None:
-    counts = [sum(p.numel() for p in Sgm(layer).parameters()) for layer in SGM_LAYERS]
+    counts = [sum(p.numel() for p in Sgm(GRASPNET, layer).parameters()) for layer in SGM_LAYERS]
     assert counts == [1400, 1400, 5104, 624, 624]
 
 
 @pytest.mark.parametrize("layer", SGM_LAYERS)
 @pytest.mark.parametrize("hidden", [None, (5,), (64, 64)])
 def test_a_gradient_has_its_activations_shape(layer: int, hidden: tuple[int, ...] | None) -> None:
-    activation = torch.randn(2, CHANNELS[layer], 7, 6)
-    assert Sgm(layer, hidden)(activation, torch.randn(2, 3)).shape == activation.shape
+    activation = torch.randn(2, GRASPNET.layer(layer).out, 7, 6)
+    assert Sgm(GRASPNET, layer, hidden)(activation, torch.randn(2, 3)).shape == activation.shape
 
 
 @pytest.mark.parametrize("teacher", [None, lambda *_: None])
 def test_forward_changes_no_bit(teacher: Teacher | None) -> None:
     case = Case()
-    activation = torch.randn(BATCH, CHANNELS[LAYER], 3, 3)
+    activation = torch.randn(BATCH, CHANNELS, 3, 3)
     activation[0, 0, 0, :] = torch.tensor([-0.0, float("inf"), 1e-45])
     behind = SgmLayer(case.sgm, teacher)(activation, case.labels)
     assert torch.equal(behind.view(torch.int32), activation.view(torch.int32))
@@ -104,8 +106,8 @@ def test_only_the_teacher_gives_the_sgm_gradients() -> None:
 
 
 def test_before_another_sgm_a_teacher_is_told_that_ones_gradient() -> None:
-    case, behind = Case(), Sgm(LAYER).eval()
-    activation = torch.randn(BATCH, CHANNELS[LAYER], 1, 1, requires_grad=True)
+    case, behind = Case(), Sgm(GRASPNET, LAYER).eval()
+    activation = torch.randn(BATCH, CHANNELS, 1, 1, requires_grad=True)
     told = SgmLayer(case.sgm, lambda _, incoming: case.told.append((incoming, incoming)))
     case.rest(SgmLayer(behind)(told(activation, case.labels), case.labels)).mean().backward()
     expected = behind(activation.detach(), case.labels)
@@ -117,8 +119,8 @@ def test_a_local_update_equals_autograd_through_the_sgm_layer(
     hidden: tuple[int, ...] | None,
 ) -> None:
     torch.manual_seed(1)
-    sgm, conv = Sgm(LAYER, hidden).eval(), nn.Conv2d(16, CHANNELS[LAYER], 1)
-    last = nn.Conv2d(CHANNELS[LAYER], 3, 1)
+    sgm, conv = Sgm(GRASPNET, LAYER, hidden).eval(), nn.Conv2d(16, CHANNELS, 1)
+    last = nn.Conv2d(CHANNELS, 3, 1)
     features, labels = torch.randn(BATCH, 16, 1, 1).relu(), torch.randn(BATCH, 3)
     last.weight.requires_grad_(False)
 
@@ -138,7 +140,9 @@ def test_a_local_update_equals_autograd_through_the_sgm_layer(
     rates = [torch.tensor(1.0), torch.tensor(0.0)]
     seen = features.flatten(2).transpose(1, 2)[None]
     with torch.no_grad():
-        updated = local_step(states, seen, labels[None], rates, gradient_of, momentum=0.9)[0]
+        updated = local_step(
+            GRASPNET, states, seen, labels[None], rates, gradient_of, momentum=0.9
+        )[0]
         weight, bias = (parameter - parameter.grad for parameter in conv.parameters())
     torch.testing.assert_close(updated.weight[0], weight.flatten(1).T, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(updated.bias[0], bias, rtol=1e-5, atol=1e-5)

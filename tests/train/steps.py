@@ -1,16 +1,14 @@
-"""Exported training steps and probes against plain torch convolutions and autograd.
+"""Runs of step graphs and probes against plain torch convolutions and autograd.
 
 Sums over thousands of positions come out differently in another order, and the order is up to the
 CPU. So every step begins at the graph's own state, and what it makes of that is held to what torch
 makes of it in float64: it may be a few times as far off as torch in float32 is, and no farther.
 """
 
-import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -18,30 +16,20 @@ import onnx
 import onnxruntime as ort
 import pytest
 import torch
-from nets import random_net
+from losses import GraspLoss, Loss
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qsgm import QsgmError
-from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers, tuned_layers
-from qsgm.grasp.task import GraspTask
+from qsgm.blocks import Blocks
+from qsgm.grasp.network import GRASPNET
+from qsgm.network import Pair
 from qsgm.sgm.float import FoldedConv, FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
-from qsgm.train.graphs.build import Graph
-from qsgm.train.graphs.inspection import (
-    all_nodes,
-    integer_operators,
-    refuse_float_products,
-)
-from qsgm.train.graphs.layers import is_positive
 from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
-from qsgm.train.graphs.probe import probe_model
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.model.arrays import FoldedNet
-from qsgm.train.model.curvature import FLAT, Curvature
-from qsgm.train.model.fold import fold_net, fold_sgm, run_folded_conv, run_folded_sgm
+from qsgm.train.model.fold import fold_sgm, run_folded_conv, run_folded_sgm
 from qsgm.train.model.sgm import Sgm
-from qsgm.tune.loop import StepLoop
 from qsgm.weights import to_step_layout
 
 CROPS, BATCH = 37, 8
@@ -58,7 +46,8 @@ RATES = {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.002, 5: 0.005, 6: 0.02}
 # Input of the first tuned layer, by how many are tuned; of all six it is the pixels.
 POSITIONS = {1: 1, 2: 1, 3: 169, 4: 841, 5: 3844, 6: 16384}
 CHANNELS = {1: 16, 2: 16, 3: 16, 4: 8, 5: 8, 6: 3}
-LOSSES = [GraspTask(), GraspTask("paper", label_smoothing=0.0, angle_weight=3.0)]
+HEADS = GraspLoss().heads
+OPTIMIZERS = pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
 TORCH_OPTIMIZERS: dict[type, Callable[..., torch.optim.Optimizer]] = {
     Sgd: lambda groups: torch.optim.SGD(groups, momentum=0.9),
     Adam: torch.optim.Adam,
@@ -69,14 +58,9 @@ Arrays = dict[str, np.ndarray]
 NOTHING: Mapping[int, Tensor] = MappingProxyType({})
 
 
-@pytest.fixture(scope="module")
-def net() -> FoldedNet:
-    return fold_net(random_net(0))
-
-
 def random_sgms(hidden: Sequence[int] | None = None) -> dict[int, FoldedSgm]:
     torch.manual_seed(4)
-    return {layer: fold_sgm(Sgm(layer, hidden).eval()) for layer in range(1, 6)}
+    return {layer: fold_sgm(Sgm(GRASPNET, layer, hidden).eval()) for layer in range(1, 6)}
 
 
 def quiet(sgms: dict[int, FoldedSgm]) -> dict[int, FoldedSgm]:
@@ -161,13 +145,13 @@ class Reference:
         optimizer: Optimizer,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        self.loss = loss
+        self.loss, self.network = loss, net.network
         self.moments = optimizer.moments
         self.convs = {}
         for number in layers:
-            folded = net.layers[number - 1]
-            out_channels, in_channels, kernel, _ = folded.weight.shape
-            conv = nn.Conv2d(in_channels, out_channels, kernel, folded.stride)
+            folded, layer = net.layers[number - 1], net.network.layer(number)
+            out_channels, in_channels, *kernel = folded.weight.shape
+            conv = nn.Conv2d(in_channels, out_channels, kernel, layer.stride, layer.padding)
             conv.weight.data = torch.tensor(folded.weight, dtype=dtype)
             conv.bias.data = torch.tensor(folded.bias, dtype=dtype)
             self.convs[number] = conv
@@ -214,24 +198,25 @@ class Reference:
         return state
 
     def layer(self, number: int, x: Tensor) -> Tensor:
-        x = self.convs[number](x)
-        if number < 6:
+        x, layer = self.convs[number](x), self.network.layer(number)
+        if layer.relu:
             self.before_relu[number] = x.detach()
             gate = x.detach() > 0
             x = x * (gate ^ self.turned[number] if number in self.turned else gate)
-        return F.avg_pool2d(x, 5) if number == 4 else x
+        return F.avg_pool2d(x, layer.pool, layer.pool_stride)
 
     def step(
         self, data: Arrays, rows: np.ndarray, blocks: Blocks, sgms: Mapping[int, AnySgm]
     ) -> float:
         """Every block sees a detached input, and the SGM's gradient as if from behind."""
-        x, labels = picked(data, rows, self.convs[6].weight.dtype)
+        dtype, depth = self.convs[blocks.layers[0]].weight.dtype, self.network.depth
+        x, labels = picked(data, rows, self.network.before(blocks.layers[0]), dtype)
         stand_in = torch.zeros(())
         for group in blocks.groups:
             x = x.detach()
             for number in group:
                 x = self.layer(number, x)
-            if group[-1] < 6:
+            if group[-1] < depth:
                 gradient = sgm_gradient(sgms[group[-1]], x.detach(), labels)
                 stand_in = stand_in + (x * gradient).sum() / len(x)
         return self.finish(self.loss(x.flatten(1), labels), stand_in)
@@ -270,7 +255,7 @@ def sgm_gradient(sgm: AnySgm, activation: Tensor, labels: Tensor) -> Tensor:
     if isinstance(sgm, FoldedSgm):
         return run_folded_sgm(in_type(sgm, activation.dtype), activation, labels)
     gradient = integer_forward(sgm, seen_by_sgm(activation, labels).numpy())[0]
-    return as_map(gradient)
+    return as_map(gradient, sgm.side)
 
 
 def in_type(sgm: FoldedSgm, dtype: torch.dtype) -> FoldedSgm:
@@ -291,21 +276,21 @@ def rows_of(maps: Tensor) -> Tensor:
     return maps.flatten(2).transpose(1, 2)
 
 
-def as_map(features: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+def as_map(features: np.ndarray, side: Pair, dtype: torch.dtype = torch.float32) -> Tensor:
     """Position-major (N, P, C) to (N, C, H, W); pixels to [-1, 1]."""
-    count, positions, channels = features.shape
-    side = round(positions**0.5)
     values = torch.tensor(features, dtype=dtype)
     if features.dtype == np.uint8:
         values = values / 127.5 - 1
-    return values.reshape(count, side, side, channels).permute(0, 3, 1, 2)
+    return values.reshape(len(features), *side, -1).permute(0, 3, 1, 2)
 
 
 def picked(
-    data: Arrays, rows: np.ndarray, dtype: torch.dtype = torch.float32
+    data: Arrays, rows: np.ndarray, side: Pair, dtype: torch.dtype = torch.float32
 ) -> tuple[Tensor, Tensor]:
     """Features as a map and labels of a batch."""
-    return as_map(data["features"][rows], dtype), torch.tensor(data["labels"][rows], dtype=dtype)
+    return as_map(data["features"][rows], side, dtype), torch.tensor(
+        data["labels"][rows], dtype=dtype
+    )
 
 
 def assert_same_weights(exported: Exported, reference: Reference, tolerance: float) -> None:
@@ -327,38 +312,8 @@ def batches(steps: int) -> list[np.ndarray]:
     return rows[:steps]
 
 
-SINGLE_STEPS = ["6", "5,6", "4,5,6", "4,5-6", "4-5,6", "4-6", "3,4-5,6", "3-6", "2,3,4,5,6"]
-SINGLE_STEPS += ["1,2,3,4,5,6", "1-4,5,6", "1-2,3,4-6", "1-6"]
-
-
-@pytest.mark.parametrize("loss", LOSSES, ids=["double", "paper"])
-@pytest.mark.parametrize("text", SINGLE_STEPS)
-def test_an_update_equals_autograd_with_the_sgms_gradient_injected_behind_every_block(
-    net: FoldedNet, text: str, loss: Loss
-) -> None:
-    for hidden in (None, (12, 10)):
-        compare_steps(net, parse_blocks(text), quiet(random_sgms(hidden)), loss, Sgd(), EPOCH)
-
-
-OPTIMIZERS = pytest.mark.parametrize("optimizer", [Sgd(), Adam()], ids=["sgd", "adam"])
-
-
-@OPTIMIZERS
-@pytest.mark.parametrize("text", ["6", "5,6", "4,5,6", "4,5-6", "5-6", "4-6"])
-def test_a_hundred_steps_equal_torchs(net: FoldedNet, text: str, optimizer: Optimizer) -> None:
-    compare_runs(net, parse_blocks(text), optimizer, steps=100)
-
-
-@OPTIMIZERS
-@pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1-6", "2-4,5,6", "3,4,5-6"])
-def test_a_few_steps_of_many_layers_equal_torchs(
-    net: FoldedNet, text: str, optimizer: Optimizer
-) -> None:
-    compare_runs(net, parse_blocks(text), optimizer, steps=6)
-
-
 def compare_runs(net: FoldedNet, blocks: Blocks, optimizer: Optimizer, steps: int) -> None:
-    exported = compare_steps(net, blocks, quiet(random_sgms()), GraspTask(), optimizer, steps)
+    exported = compare_steps(net, blocks, quiet(random_sgms()), GraspLoss(), optimizer, steps)
     start = {k: to_step_layout(net.layers[k - 1].weight) for k in blocks.layers}
     moved = [float(np.abs(exported.feeds[f"weight{k}"] - start[k]).max()) for k in start]
     assert max(moved) > 5e-3
@@ -373,6 +328,7 @@ def compare_steps(
     loss: Loss,
     optimizer: Optimizer,
     steps: int,
+    data: Arrays | None = None,
 ) -> Exported:
     """A run of the graph, whose every step torch takes as well, from the same state.
 
@@ -381,8 +337,8 @@ def compare_steps(
     formula for each entry on its own: Adam divides one moment by the other, and where both are
     next to nothing the quotients of two right sums need not have a digit in common.
     """
-    data = random_data(len(blocks.layers))
-    exported = Exported(step_model(net, blocks, sgms, loss, optimizer), net, data)
+    data = random_data(len(blocks.layers)) if data is None else data
+    exported = Exported(step_model(net, blocks, sgms, loss.heads, optimizer), net, data)
     exact, rounded = (
         Reference(net, blocks.layers, loss, optimizer, dtype)
         for dtype in (torch.float64, torch.float32)
@@ -461,36 +417,17 @@ def error(got: np.ndarray, truth: np.ndarray, doubt: np.ndarray) -> float:
     return float(np.maximum(np.abs(got.reshape(truth.shape) - truth) - doubt, 0).max())
 
 
-def test_a_gate_is_one_above_zero_and_else_zero_however_small_or_large_a_number_is() -> None:
-    graph = Graph("gate")
-    op, x = graph.within("gate"), graph.input("x", np.float32, ("numbers",))
-    graph.output("gates", is_positive(op, x), np.float32, ("numbers",))
-    limits = np.finfo(np.float32)
-    sizes = np.float32([limits.tiny, 1e-30, 1, 1e30, limits.max, np.inf])
-    numbers = np.concatenate([[0, -0.0], sizes, -sizes], dtype=np.float32)
-    gates = session(graph.model()).run(None, {"x": numbers})[0]
-    np.testing.assert_array_equal(gates, numbers > 0)
-
-
-def test_loss_and_update_stay_finite_for_extreme_logits(net: FoldedNet) -> None:
-    data = random_data(1)
-    data["features"] *= 1e5
-    exported = Exported(step_model(net, one_block(1), {}, GraspTask(), Sgd()), net, data)
-    results = exported.step(np.arange(CROPS))
-    assert all(np.isfinite(value).all() for value in results.values())
-    assert results["loss"] > 1000
-
-
 def seen_by_sgms(
     net: FoldedNet, tuned: int, data: Arrays, sgms: dict[int, FoldedSgm]
 ) -> dict[int, SgmRanges]:
-    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
-    x, labels = picked(data, np.arange(len(data["labels"])))
+    reference = Reference(net, GRASPNET.last(tuned), GraspLoss(), Sgd())
+    first = GRASPNET.last(tuned)[0]
+    x, labels = picked(data, np.arange(len(data["labels"])), GRASPNET.before(first))
     ranges = {}
-    for number in tuned_layers(tuned)[:-1]:
+    for number in GRASPNET.last(tuned)[:-1]:
         x = reference.layer(number, x).detach()
         seen = seen_by_sgm(x, labels)
-        hidden = [as_map(seen.numpy())]
+        hidden = [as_map(seen.numpy(), sgms[number].side)]
         for conv in sgms[number].convs[:-1]:
             hidden.append(F.relu(run_folded_conv(conv, hidden[-1])))
         highs = tuple(tensor.amax(dim=(0, 2, 3)).numpy() for tensor in hidden[1:])
@@ -504,230 +441,3 @@ def quantized(
 ) -> dict[int, QuantizedSgm]:
     ranges = seen_by_sgms(net, tuned, data, sgms)
     return {number: quantize_sgm(sgms[number], ranges[number]) for number in ranges}
-
-
-@pytest.mark.parametrize(
-    ("text", "hidden"),
-    [
-        *((text, hidden) for text in ("5,6", "4,5,6", "4,5-6") for hidden in (None, (64, 64))),
-        ("3,4-5,6", None),
-        ("1,2,3,4,5,6", None),
-        ("1-3,4,5,6", (12, 10)),
-    ],
-)
-def test_an_int8_step_equals_autograd_with_the_integer_sgms_gradient(
-    net: FoldedNet, text: str, hidden: Sequence[int] | None
-) -> None:
-    blocks = parse_blocks(text)
-    data, sgms, rows = random_data(len(blocks.layers), 12), random_sgms(hidden), np.arange(BATCH)
-    int8_sgms = quantized(net, len(blocks.layers), data, sgms)
-    model = step_model(net, blocks, int8_sgms, GraspTask(), Sgd())
-    products = 2 * len(sgms[4].convs) * len(blocks.sgm_layers)
-    assert integer_operators(model) == ["QGemm"] * products
-    refuse_float_products(text, model)
-    exported = Exported(model, net, data)
-    reference = Reference(net, blocks.layers, GraspTask(), Sgd())
-    reference.step(data, rows, blocks, int8_sgms)
-    exported.step(rows)
-    assert_same_weights(exported, reference, 1e-5)
-
-
-@pytest.mark.parametrize(
-    ("tuned", "hidden"),
-    [(2, None), (2, (64, 64)), (3, None), (3, (64, 64)), (4, (12, 10)), (6, None)],
-)
-def test_the_probe_gives_true_float_and_int8_gradients(
-    net: FoldedNet, tuned: int, hidden: Sequence[int] | None
-) -> None:
-    data, sgms, rows = random_data(tuned, 12), random_sgms(hidden), np.arange(BATCH)
-    int8_sgms = quantized(net, tuned, data, sgms)
-    model = probe_model(net, tuned, sgms, int8_sgms, GraspTask())
-    assert integer_operators(model) == ["QGemm"] * 2 * len(sgms[4].convs) * (tuned - 1)
-    got = Exported(model, net, data).step(rows)
-
-    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
-    x, labels = picked(data, rows)
-    activations = {}
-    for number in reference.convs:
-        x = activations[number] = reference.layer(number, x)
-    behind = {number: activations[number] for number in tuned_layers(tuned)[:-1]}
-    total = GraspTask().per_sample(x.flatten(1), labels).sum()
-    truths = torch.autograd.grad(total, list(behind.values()))
-    for (number, activation), truth in zip(behind.items(), truths, strict=True):
-        seen = activation.detach()
-        for name, expected in (
-            ("true", truth),
-            ("float", sgm_gradient(sgms[number], seen, labels)),
-        ):
-            np.testing.assert_allclose(got[f"{name}{number}"], rows_of(expected), atol=1e-5)
-        integers = rows_of(sgm_gradient(int8_sgms[number], seen, labels)).numpy()
-        # Activations differ in their last bits between the two; a few then round the other way.
-        atol = 3e-4 * np.abs(integers).max()
-        np.testing.assert_allclose(got[f"int8{number}"], integers, atol=atol)
-        assert got[f"clipped{number}"] == 0
-
-
-@pytest.mark.parametrize("tuned", [2, 3, 4, 6])
-def test_the_probes_updates_are_autograds_with_each_gradient_behind_the_layer(
-    net: FoldedNet, tuned: int
-) -> None:
-    data, sgms, rows = random_data(tuned, 12), random_sgms(), np.arange(BATCH)
-    int8_sgms = quantized(net, tuned, data, sgms)
-    got = Exported(probe_model(net, tuned, sgms, int8_sgms, GraspTask()), net, data).step(rows)
-    reference = Reference(net, tuned_layers(tuned), GraspTask(), Sgd())
-    x, _ = picked(data, rows)
-    for number in tuned_layers(tuned)[:-1]:
-        after, conv = reference.layer(number, x), reference.convs[number]
-        for name in ("true", "float", "int8"):
-            given = as_map(got[f"{name}{number}"])
-            weight, bias = torch.autograd.grad(
-                (after * given).sum(), [conv.weight, conv.bias], retain_graph=True
-            )
-            expected = torch.cat([weight.permute(0, 2, 3, 1).flatten(1), bias[:, None]], dim=1)
-            found = got[f"update_{name}{number}"]
-            assert found.shape == expected.shape
-            scale = float(expected.abs().max())
-            np.testing.assert_allclose(found / scale, expected / scale, atol=1e-5)
-            assert scale > 0
-        x = after.detach()
-
-
-def test_the_probe_counts_inputs_beyond_their_ranges(net: FoldedNet) -> None:
-    data, sgms = random_data(4, 12), random_sgms()
-    int8_sgms = quantized(net, 4, data, sgms)
-    data["labels"] = np.full((12, 3), 9, np.float32)
-    got = Exported(probe_model(net, 4, sgms, int8_sgms, GraspTask()), net, data).step(np.arange(9))
-    for number in (3, 4, 5):
-        assert got[f"clipped{number}"] == pytest.approx(3 / 19)
-
-
-@pytest.mark.parametrize("text", ["4,5,6", "4-5,6", "3-4,5-6", "2,3-4,5,6"])
-def test_blocks_run_one_after_the_other_so_that_their_memory_is_freed(
-    net: FoldedNet, tmp_path: Path, text: str
-) -> None:
-    blocks = parse_blocks(text)
-    data, sgms = random_data(len(blocks.layers), BATCH), random_sgms()
-    int8_sgms = quantized(net, len(blocks.layers), data, sgms)
-    exported = Exported(step_model(net, blocks, int8_sgms, GraspTask(), Sgd()), net, data)
-    profiled = session(
-        step_model(net, blocks, int8_sgms, GraspTask(), Sgd()),
-        enable_profiling=True,
-        profile_file_prefix=str(tmp_path / "run"),
-    )
-    profiled.run(None, {**exported.feeds, "rows": np.arange(BATCH)})
-    events = json.loads(Path(profiled.end_profiling()).read_text())
-    # Reshape does nothing: it may come as late as somebody reads what it makes.
-    order = [
-        event["name"]
-        for event in events
-        if event.get("cat") == "Node" and event["args"]["op_name"] != "Reshape"
-    ]
-    numbers = [int(name[5]) for name in order if name.startswith("layer")]
-    assert set(numbers) == set(blocks.layers)
-    ran = [next(i for i, group in enumerate(blocks.groups) if n in group) for n in numbers]
-    assert ran == sorted(ran)
-
-
-@pytest.mark.parametrize(
-    ("text", "carried_back_through"),
-    [("1,2,3,4,5,6", 0), ("1-4,5,6", 3), ("3,4-5,6", 0), ("3-4,5-6", 1), ("1-6", 3)],
-)
-def test_gradients_are_carried_back_inside_blocks_only(
-    net: FoldedNet, text: str, carried_back_through: int
-) -> None:
-    """5x5 layers through which a gradient is carried back: those of a block but its first."""
-    model = step_model(net, parse_blocks(text), random_sgms(), GraspTask(), Sgd())
-    kinds = [node.op_type for node in all_nodes(model.graph)]
-    assert kinds.count("ConvTranspose") == carried_back_through
-
-
-def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
-    model = step_model(net, single_layers(2), random_sgms(), GraspTask(), Sgd())
-    state = [f"{kind}{layer}" for layer in (5, 6) for kind in ("weight", "bias")]
-    state += [name[:-1] + "_momentum" + name[-1] for name in state]
-    others = {"features", "labels", "rows", "rate5", "rate6"}
-    assert {value.name for value in model.graph.input} == {*state, *others}
-    results = {value.name for value in model.graph.output}
-    assert results == {"loss", *(f"{name}_next" for name in state)}
-    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
-
-
-def test_there_is_nothing_to_probe_behind_the_last_layer(net: FoldedNet) -> None:
-    with pytest.raises(QsgmError, match="SGMs of 1 tuned layers: the last layer has none"):
-        probe_model(net, 1, {}, {}, GraspTask())
-
-
-@OPTIMIZERS
-@pytest.mark.parametrize("text", ["4,5,6", "1-4,5,6"])
-def test_the_devices_loop_gives_what_plain_runs_of_the_graph_give(
-    net: FoldedNet, text: str, optimizer: Optimizer
-) -> None:
-    blocks = parse_blocks(text)
-    data = random_data(len(blocks.layers))
-    model = step_model(net, blocks, quiet(random_sgms((64, 64))), GraspTask(), optimizer)
-    exported = Exported(model, net, data)
-    start = {
-        name: value.copy()
-        for name, value in exported.feeds.items()
-        if name in {f"{kind}{k}" for kind in ("weight", "bias") for k in RATES}
-    }
-    rates = {number: RATES[number] for number in blocks.layers}
-    loop = StepLoop(session(model), data["features"], data["labels"], start, rates)
-    for rows in batches(12 if len(rates) == 3 else 3):
-        assert loop.step(rows) == float(exported.step(rows)["loss"])
-    tuned = loop.weights()
-    assert set(tuned) == set(start)
-    for name, value in tuned.items():
-        np.testing.assert_array_equal(value, exported.feeds[name])
-        assert not np.array_equal(value, start[name])
-
-
-def test_the_loop_takes_other_crops_in_the_place_of_those_it_has(net: FoldedNet) -> None:
-    data = random_data(3)
-    model = step_model(net, single_layers(3), quiet(random_sgms()), GraspTask(), Sgd())
-    start = {
-        name: value.copy()
-        for name, value in Exported(model, net, data).feeds.items()
-        if name in {f"{kind}{k}" for kind in ("weight", "bias") for k in (4, 5, 6)}
-    }
-    rates = {number: RATES[number] for number in (4, 5, 6)}
-    features, labels = data["features"], data["labels"]
-    whole = StepLoop(session(model), features, labels, start, rates)
-    one_by_one = StepLoop(session(model), features[:0], labels[:0], start, rates)
-    for rows in batches(6):
-        one_by_one.put(features[rows], labels[rows])
-        assert one_by_one.step(np.arange(len(rows))) == whole.step(rows)
-    for name, value in whole.weights().items():
-        np.testing.assert_array_equal(one_by_one.weights()[name], value)
-
-
-def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:
-    sgms = random_sgms()
-    del sgms[4]
-    with pytest.raises(QsgmError, match=r"no SGM for layers \[4\]: tuning 4,5,6 needs"):
-        step_model(net, single_layers(3), sgms, GraspTask(), Sgd())
-    step_model(net, parse_blocks("4-5,6"), sgms, GraspTask(), Sgd())
-
-
-@pytest.mark.parametrize("text", ["4,5,6", "5,6", "3-4,5,6"])
-def test_gradients_are_bent_in_the_graph_as_they_are_in_torch(net: FoldedNet, text: str) -> None:
-    blocks, rows = parse_blocks(text), np.arange(BATCH)
-    data, sgms = random_data(len(blocks.layers)), random_sgms()
-    torch.manual_seed(0)
-    curvatures = {
-        k: Curvature(*(torch.randn(m.shape) for m in Curvature.identity(k).matrices))
-        for k in blocks.layers
-    }
-    momenta = []
-    for used in (FLAT, curvatures):
-        exported = Exported(step_model(net, blocks, sgms, GraspTask(), Sgd(), used), net, data)
-        momenta.append(exported.step(rows))
-    for k, curvature in curvatures.items():
-        plain, bent = (
-            [torch.from_numpy(m[f"{kind}_momentum{k}_next"]) for kind in ("weight", "bias")]
-            for m in momenta
-        )
-        weight, bias = curvature.bend(plain[0].T[None], plain[1][None])
-        scale = float(weight.abs().max())
-        torch.testing.assert_close(bent[0] / scale, weight[0].T / scale, atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(bent[1], bias[0], atol=1e-4, rtol=1e-4)
