@@ -1,5 +1,6 @@
 """`sgm.pt` is read without trusting it."""
 
+import json
 import os
 import pickle
 import re
@@ -14,7 +15,9 @@ import torch
 
 from qsgm.errors import QsgmError
 from qsgm.grasp.network import GRASPNET
-from qsgm.grasp.task import GraspTask
+from qsgm.grasp.task import GraspTask, grasp_task
+from qsgm.network import Network, conv
+from qsgm.task import Head, TaskRecord, task_record
 from qsgm.train import checkpoint as module
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from qsgm.train.model.net import ConvNet
@@ -24,22 +27,22 @@ from qsgm.train.model.sgm import Sgm
 @pytest.fixture
 def checkpoint() -> Checkpoint:
     torch.manual_seed(0)
-    sgms = {4: Sgm(4, (8, 8)).eval(), 5: Sgm(5).eval()}
+    sgms = {4: Sgm(GRASPNET, 4, (8, 8)).eval(), 5: Sgm(GRASPNET, 5).eval()}
     rates = {"6": (0.03,), "5,6": (0.01, 0.03), "4,5,6": (0.005, 0.001, 0.003)}
     rates["4,5-6"] = (0.02, 0.001, 0.004)
-    return Checkpoint(
-        ConvNet(GRASPNET).eval(), sgms, {}, GraspTask(label_smoothing=0.1), rates, {"seed": 0}
-    )
+    task = task_record(GraspTask("paper", label_smoothing=0.1))
+    return Checkpoint(task, ConvNet(GRASPNET).eval(), sgms, {}, rates, {"seed": 0})
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Checkpoint) -> None:
     save_checkpoint(tmp_path / "sgm.pt", checkpoint)
     back = load_checkpoint(tmp_path / "sgm.pt")
-    assert (back.loss, back.rates, back.card) == (
-        checkpoint.loss,
+    assert (back.task, back.rates, back.card) == (
+        checkpoint.task,
         checkpoint.rates,
         checkpoint.card,
     )
+    assert grasp_task(back.task, "it") == GraspTask("paper", label_smoothing=0.1)
     assert back.sgms[4].hidden == (8, 8)
     assert not back.net.training
     for mine, theirs in ((back.net, checkpoint.net), (back.sgms[4], checkpoint.sgms[4])):
@@ -111,7 +114,14 @@ def test_someone_elses_checkpoint_is_refused(tmp_path: Path) -> None:
         ("sgms", [4, 5]),
         ("sgms", {4.0: {}}),
         ("version", torch.ones(2)),
-        ("loss", {"nonsense": 1}),
+        ("heads", '[{"nonsense": 1}]'),
+        ("heads", "[]"),
+        ("heads", "{"),
+        ("heads", 7),
+        ("task", "{}"),
+        ("task", "[" * 100_000),
+        ("network", '{"layers": []}'),
+        ("network", "null"),
     ],
 )
 def test_a_checkpoint_with_a_wrong_part_is_refused(
@@ -143,17 +153,26 @@ def test_hidden_widths_are_checked_before_anything_of_that_width_is_made(
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("encoding", "triple"),
-        ("encoding", ["double"]),
-        ("label_smoothing", 1.0),
-        ("label_smoothing", -0.1),
-        ("label_smoothing", float("nan")),
-        ("label_smoothing", "0.1"),
-        ("angle_weight", 0.0),
-        ("angle_weight", float("inf")),
-        ("angle_weight", 10**400),
-        ("angle_weight", torch.ones(3)),
-        ("more\nlines", 1),
+        ("smoothing", 1.0),
+        ("smoothing", -0.1),
+        ("smoothing", float("nan")),
+        ("smoothing", "0.1"),
+        ("smoothing", True),
+        ("weight", 0.0),
+        ("weight", float("inf")),
+        ("weight", 10**400),
+        ("weight", [1.0]),
+        ("weight", None),
+        ("channels", 2),
+        ("channels", 1.0),
+        ("channels", 0),
+        ("kind", "guess"),
+        ("kind", ["log_loss"]),
+        ("activation", "tanh"),
+        ("name", 7),
+        ("where", 3),
+        ("where", -1),
+        ("where", 0.0),
     ],
 )
 def test_a_loss_that_cannot_be_is_refused(
@@ -162,8 +181,48 @@ def test_a_loss_that_cannot_be_is_refused(
     path = tmp_path / "sgm.pt"
     save_checkpoint(path, checkpoint)
     data = torch.load(path, weights_only=True)
-    torch.save(data | {"loss": data["loss"] | {field: value}}, path)
+    heads = json.loads(data["heads"])
+    heads[0][field] = value
+    torch.save(data | {"heads": json.dumps(heads)}, path)
     assert "does not fit" in refuse(path)
+
+
+@pytest.mark.parametrize("encoding", ["triple", ["double"], None])
+def test_angles_encoded_in_no_known_way_are_refused(
+    tmp_path: Path, checkpoint: Checkpoint, encoding: Any
+) -> None:
+    path = tmp_path / "sgm.pt"
+    save_checkpoint(path, checkpoint)
+    data = torch.load(path, weights_only=True)
+    task = json.loads(data["task"]) | {"encoding": encoding}
+    torch.save(data | {"task": json.dumps(task)}, path)
+    with pytest.raises(QsgmError, match="'encoding' is damaged: expected double or paper"):
+        grasp_task(load_checkpoint(path).task, str(path))
+
+
+def test_a_network_too_large_for_a_checkpoint_is_refused_before_it_is_made(
+    tmp_path: Path, checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "sgm.pt"
+    save_checkpoint(path, checkpoint)
+    data = torch.load(path, weights_only=True)
+    network = Network((64, 64, 3), (conv(3, 4096, 64), conv(4096, 3, relu=False)))
+    torch.save(data | {"network": json.dumps(network.to_json())}, path)
+    monkeypatch.setattr(module, "ConvNet", lambda *_: pytest.fail("a network was made"))
+    assert "more weights than a checkpoint could hold" in refuse(path)
+
+
+def test_a_checkpoint_of_another_task_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    network = Network((1, 30, 2), (conv(2, 4, (1, 5)), conv(4, 2, (1, 26), relu=False)), "numbers")
+    heads = (Head("class", "cross_entropy", 2, "softmax", weight=2.0, smoothing=0.1),)
+    task = TaskRecord("other", network, heads, {"classes": ["a", "b"]})
+    net = ConvNet(network).eval()
+    made = Checkpoint(task, net, {1: Sgm(network, 1)}, {}, {"2": (0.1,), "1,2": (0.1, 0.1)}, {})
+    save_checkpoint(tmp_path / "sgm.pt", made)
+    back = load_checkpoint(tmp_path / "sgm.pt")
+    assert back.task == task
+    for name, value in net.state_dict().items():
+        assert torch.equal(back.net.state_dict()[name], value)
 
 
 @pytest.mark.parametrize(
@@ -196,17 +255,18 @@ def test_rates_that_cannot_be_are_refused(
 
 @pytest.mark.parametrize("layers", [(4,), (3, 4, 5), (3, 5), (1, 2, 3, 4, 5)])
 def test_sgms_and_rates_of_other_layers_do_not_go_together(layers: tuple[int, ...]) -> None:
-    sgms = {layer: Sgm(layer) for layer in layers}
+    sgms = {layer: Sgm(GRASPNET, layer) for layer in layers}
     rates = {text: tuple(values) for text, values in GOOD_RATES.items()}
     with pytest.raises(ValueError, match=r"SGMs stand behind|no rates for layers 3,4,5,6"):
-        Checkpoint(ConvNet(GRASPNET), sgms, {}, GraspTask(), rates, {})
+        Checkpoint(task_record(GraspTask()), ConvNet(GRASPNET), sgms, {}, rates, {})
 
 
 def test_the_number_of_layers_that_can_be_tuned_is_that_of_the_sgms_and_the_last(
     checkpoint: Checkpoint,
 ) -> None:
     assert checkpoint.most_layers == 3
-    assert Checkpoint(checkpoint.net, {}, {}, GraspTask(), {"6": (0.1,)}, {}).most_layers == 1
+    alone = Checkpoint(checkpoint.task, checkpoint.net, {}, {}, {"6": (0.1,)}, {})
+    assert alone.most_layers == 1
 
 
 def packed(path: Path) -> None:

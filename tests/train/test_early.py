@@ -5,7 +5,8 @@ import torch
 from nets import random_net
 from torch.nn import functional as F
 
-from qsgm.grasp.task import GraspTask
+from qsgm.grasp.network import GRASPNET
+from qsgm.train.grasp.task import DrawnGrasping
 from qsgm.train.model.curvature import FLAT
 from qsgm.train.model.fold import folded_start
 from qsgm.train.model.local import outputs
@@ -27,7 +28,7 @@ from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, start_states
 CONFIG = MapConfig(
     tasks=2, crops_per_task=20, epochs=2, looks=(1, 2), steps=40, tasks_per_step=2, crops_per_step=4
 )
-LOSS = GraspTask()
+TASK = DrawnGrasping()
 
 
 @pytest.fixture(scope="module")
@@ -37,20 +38,20 @@ def net() -> ConvNet:
 
 @pytest.fixture(scope="module")
 def pixels(net: ConvNet) -> TaskSet:
-    return draw_tasks(net, 2, 20, 5, LOSS, lambda: None, last_frozen=0)
+    return draw_tasks(net, TASK, 2, 20, 5, lambda: None, last_frozen=0)
 
 
 @pytest.fixture(scope="module")
 def rule() -> UpdateRule:
     torch.manual_seed(0)
-    sgms = {layer: Sgm(layer).eval() for layer in range(1, 6)}
-    return UpdateRule(sgms, FLAT, (1e-3, 1e-3, 1e-3), LOSS)
+    sgms = {layer: Sgm(GRASPNET, layer).eval() for layer in range(1, 6)}
+    return UpdateRule(sgms, FLAT, (1e-3, 1e-3, 1e-3), TASK)
 
 
 def test_features_behind_layers_are_those_of_the_network(net: ConvNet, pixels: TaskSet) -> None:
-    seen = behind(folded_start(net, 6)[:3], pixels)
-    whole = outputs(start_states(folded_start(net, 6), 2), pixels.features.float())
-    rest = outputs(start_states(folded_start(net, 3), 2), seen.features)
+    seen = behind(GRASPNET, folded_start(net, 6)[:3], pixels)
+    whole = outputs(GRASPNET, start_states(folded_start(net, 6), 2), pixels.features.float())
+    rest = outputs(GRASPNET, start_states(folded_start(net, 3), 2), seen.features)
     torch.testing.assert_close(rest, whole, atol=1e-4, rtol=1e-4)
 
 
@@ -88,16 +89,18 @@ def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_their
     scores: list[Score] = []
     config = RatesConfig(epochs=1, early_epochs=1)
     start = folded_start(net, 6)
-    late, best = choose_late(rule, start[3:], behind(start[:3], pixels), config, scores.append)
+    late, best = choose_late(
+        rule, start[3:], behind(GRASPNET, start[:3], pixels), config, scores.append
+    )
     assert [len(late[tuned]) for tuned in (1, 2, 3)] == [1, 2, 3]
     assert len(scores) == len([*late_candidates(rule.rates)])
     lowest = min(score.objective for score in scores[-4:])
     assert lowest <= best.objective <= 1.01 * lowest
     short = RatesConfig(short_epochs=1)
-    trial = UpdateRule(rule.sgms, FLAT, late[3], LOSS)
-    seen = behind(start[:3], pixels)
+    trial = UpdateRule(rule.sgms, FLAT, late[3], TASK)
+    seen = behind(GRASPNET, start[:3], pixels)
     assert choose_short_gain(trial, start[3:], seen, short, scores.append) in SHORT_GAINS
-    rule = UpdateRule(rule.sgms, FLAT, late[3], LOSS)
+    rule = UpdateRule(rule.sgms, FLAT, late[3], TASK)
     early = choose_early(rule, start, pixels, config, scores.append)
     assert sorted(early) == [4, 5, 6]
     assert early[6][1:] == early[5]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from qsgm import QsgmError
+from qsgm.network import ONE, Pair, area
 from qsgm.runtime import session_options
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm
 from qsgm.sgm.int8 import (
@@ -42,15 +43,20 @@ ALL, NONE = ort.GraphOptimizationLevel.ORT_ENABLE_ALL, ort.GraphOptimizationLeve
 
 DEPTHS = pytest.mark.parametrize("hidden", [(16,), (64, 64), (12, 20, 8)])
 BITS = pytest.mark.parametrize("bits", ACTIVATION_BITS)
-KERNELS = pytest.mark.parametrize(("kernel", "side"), [(1, 1), (3, 5)], ids=["1x1", "3x3"])
+KERNELS = pytest.mark.parametrize(
+    ("kernel", "side"), [(ONE, ONE), ((3, 3), (5, 5))], ids=["1x1", "3x3"]
+)
 
 
-def random_sgm(rng: np.random.Generator, channels: int, *hidden: int, kernel: int = 1) -> FoldedSgm:
+def random_sgm(
+    rng: np.random.Generator, channels: int, *hidden: int, kernel: Pair = ONE, side: Pair = ONE
+) -> FoldedSgm:
     widths, convs = (channels + 3, *hidden, channels), []
     for into, out in pairwise(widths):
-        weight, bias = rng.normal(size=(out, into, kernel, kernel)), rng.normal(size=out)
-        convs.append(FoldedConv(weight.astype(np.float32) / kernel, bias.astype(np.float32)))
-    return FoldedSgm(4 if kernel == 1 else 2, tuple(convs))
+        weight, bias = rng.normal(size=(out, into, *kernel)), rng.normal(size=out)
+        size = np.sqrt(area(kernel))
+        convs.append(FoldedConv((weight / size).astype(np.float32), bias.astype(np.float32)))
+    return FoldedSgm(4 if kernel == ONE else 2, side, tuple(convs))
 
 
 def random_inputs(
@@ -64,15 +70,15 @@ def random_inputs(
     return np.concatenate([activation, labels], axis=2).astype(np.float32)
 
 
-def float_product(conv: FoldedConv, x: FloatArray) -> FloatArray:
-    """A padded convolution of square maps (N, P, I), tap by tap: (N, P, O)."""
+def float_product(conv: FoldedConv, side: Pair, x: FloatArray) -> FloatArray:
+    """A padded convolution of maps (N, P, I), tap by tap: (N, P, O)."""
     count, positions, _ = x.shape
-    side, kernel = round(positions**0.5), conv.weight.shape[2]
-    pad = kernel // 2
-    maps = np.pad(x.reshape(count, side, side, -1), ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    total = np.broadcast_to(conv.bias, (count, side, side, len(conv.bias)))
-    for dy, dx in np.ndindex(kernel, kernel):
-        total = total + maps[:, dy : dy + side, dx : dx + side] @ conv.weight[:, :, dy, dx].T
+    (height, width), kernel = side, conv.weight.shape[2:]
+    up, left = (length // 2 for length in kernel)
+    maps = np.pad(x.reshape(count, height, width, -1), ((0, 0), (up, up), (left, left), (0, 0)))
+    total = np.broadcast_to(conv.bias, (count, height, width, len(conv.bias)))
+    for dy, dx in np.ndindex(*kernel):
+        total = total + maps[:, dy : dy + height, dx : dx + width] @ conv.weight[:, :, dy, dx].T
     return total.reshape(count, positions, -1)
 
 
@@ -80,12 +86,12 @@ def float_hidden(sgm: FoldedSgm, inputs: FloatArray) -> list[FloatArray]:
     """Every hidden tensor, behind its ReLU."""
     tensors = [inputs]
     for conv in sgm.convs[:-1]:
-        tensors.append(np.maximum(float_product(conv, tensors[-1]), 0))
+        tensors.append(np.maximum(float_product(conv, sgm.side, tensors[-1]), 0))
     return tensors[1:]
 
 
 def float_gradient(sgm: FoldedSgm, inputs: FloatArray) -> FloatArray:
-    return float_product(sgm.convs[-1], [inputs, *float_hidden(sgm, inputs)][-1])
+    return float_product(sgm.convs[-1], sgm.side, [inputs, *float_hidden(sgm, inputs)][-1])
 
 
 def seen_ranges(sgm: FoldedSgm, inputs: FloatArray) -> SgmRanges:
@@ -100,18 +106,18 @@ def gradient_of_rounded_activations(
     x = q.input_low + to_u8((inputs - q.input_low) * q.input_gain) / q.input_gain
     for conv, high in zip(sgm.convs, ranges.hidden_high, strict=False):
         step = np.where(high > 0, high, 1) / 255
-        x = step * to_u8(float_product(conv, x) / step)
-    return float_product(sgm.convs[-1], x)
+        x = step * to_u8(float_product(conv, sgm.side, x) / step)
+    return float_product(sgm.convs[-1], sgm.side, x)
 
 
-def int8_model(q: QuantizedSgm, side: int = 1) -> onnx.ModelProto:
+def int8_model(q: QuantizedSgm) -> onnx.ModelProto:
     """Inputs to gradient, clipped fraction and the hidden tensors' planes."""
-    inputs, channels = len(q.input_low), len(q.products[-1].bias)
+    inputs, channels, positions = len(q.input_low), len(q.products[-1].bias), area(q.side)
     graph = Graph("int8")
     op = graph.within("layer2")
-    maps = graph.input("inputs", np.float32, ("batch", side**2, inputs))
-    seen, shape = op.Reshape(maps, op.shape(-1, inputs)), (side**2, channels)
-    gradient = op.Reshape(int8_sgm(op, q, side, seen), op.shape(-1, *shape))
+    maps = graph.input("inputs", np.float32, ("batch", positions, inputs))
+    seen, shape = op.Reshape(maps, op.shape(-1, inputs)), (positions, channels)
+    gradient = op.Reshape(int8_sgm(op, q, seen), op.shape(-1, *shape))
     graph.output("gradient", gradient, np.float32, ("batch", *shape))
     clipped = clipped_fraction(op, q, scaled_inputs(op, q, seen))
     graph.output("clipped", clipped, np.float32, ())
@@ -141,7 +147,18 @@ def run(
     channels=st.integers(1, 24),
     hidden=st.lists(st.integers(1, 70), min_size=1, max_size=3),
     rows=st.integers(1, 40),
-    kernel_and_side=st.sampled_from([(1, 1), (3, 1), (3, 2), (3, 7)]),
+    kernel_and_side=st.sampled_from(
+        [
+            (ONE, ONE),
+            ((3, 3), ONE),
+            ((3, 3), (2, 2)),
+            ((3, 3), (7, 7)),
+            ((3, 3), (2, 5)),
+            ((3, 3), (4, 1)),
+            ((1, 3), (1, 9)),
+            ((3, 1), (6, 1)),
+        ]
+    ),
     bits=st.sampled_from(ACTIVATION_BITS),
     outlier=st.sampled_from([1.0, 1.5, 1e3, 1e12]),
 )
@@ -150,16 +167,16 @@ def test_onnx_runtime_computes_the_int8_sgm_bit_for_bit(
     channels: int,
     hidden: list[int],
     rows: int,
-    kernel_and_side: tuple[int, int],
+    kernel_and_side: tuple[Pair, Pair],
     bits: ActivationBits,
     outlier: float,
 ) -> None:
     rng, (kernel, side) = np.random.default_rng(seed), kernel_and_side
-    sgm = random_sgm(rng, channels, *hidden, kernel=kernel)
-    inputs = random_inputs(rng, sgm, rows, side**2)
+    sgm = random_sgm(rng, channels, *hidden, kernel=kernel, side=side)
+    inputs = random_inputs(rng, sgm, rows, area(side))
     q = quantize_sgm(sgm, seen_ranges(sgm, inputs), bits)
     wild = (inputs * np.where(rng.random(inputs.shape) < 0.1, outlier, 1)).astype(np.float32)
-    model = int8_model(q, side)
+    model = int8_model(q)
     gradient, hidden_u8, clipped = integer_trace(q, wild)
     optimized = run(model, ALL, wild)
     for got, expected in zip(optimized[2], [u8 for both in hidden_u8 for u8 in both], strict=True):
@@ -207,12 +224,12 @@ def test_without_graph_optimizations_16_bit_gradients_stay_the_same_to_a_ten_tho
 @DEPTHS
 @KERNELS
 def test_all_products_become_integer_operators_and_no_float_product_is_left(
-    hidden: tuple[int, ...], kernel: int, side: int, bits: ActivationBits
+    hidden: tuple[int, ...], kernel: Pair, side: Pair, bits: ActivationBits
 ) -> None:
     rng = np.random.default_rng(0)
-    sgm = random_sgm(rng, 16, *hidden, kernel=kernel)
-    inputs = random_inputs(rng, sgm, 50, side**2)
-    model = int8_model(quantize_sgm(sgm, seen_ranges(sgm, inputs), bits), side)
+    sgm = random_sgm(rng, 16, *hidden, kernel=kernel, side=side)
+    inputs = random_inputs(rng, sgm, 50, area(side))
+    model = int8_model(quantize_sgm(sgm, seen_ranges(sgm, inputs), bits))
     assert integer_operators(model) == ["QGemm"] * 2 * (len(hidden) + 1)
     refuse_float_products("one SGM", model)
     kinds = [node.op_type for node in optimized_nodes(model)]
@@ -229,8 +246,8 @@ def test_int8_stays_close_to_float_whatever_the_channels_scales(
     bits: ActivationBits,
     least_sqnr_db: float,
     hidden: tuple[int, ...],
-    kernel: int,
-    side: int,
+    kernel: Pair,
+    side: Pair,
 ) -> None:
     # On average: of one random SGM the gradient is a small difference of large terms, of another
     # it is not, and the ratio of one is 10 dB from another's (a standard deviation of 1 to 2.7).
@@ -245,7 +262,7 @@ def test_int8_stays_close_to_float_whatever_the_channels_scales(
 @KERNELS
 @pytest.mark.parametrize("seed", range(3))
 def test_how_loud_a_channel_is_costs_the_others_nothing(
-    seed: int, bits: ActivationBits, hidden: tuple[int, ...], kernel: int, side: int
+    seed: int, bits: ActivationBits, hidden: tuple[int, ...], kernel: Pair, side: Pair
 ) -> None:
     # Both times it is the loudest: what the typical channel is, does not change.
     loud, louder = (
@@ -260,13 +277,13 @@ def sqnr_db_with_a_loud_channel(
     seed: int,
     bits: ActivationBits,
     hidden: tuple[int, ...],
-    kernel: int,
-    side: int,
+    kernel: Pair,
+    side: Pair,
 ) -> float:
     """Of a random SGM, one of whose channels is so many times louder and weighs as much less."""
     rng = np.random.default_rng(seed)
-    sgm = random_sgm(rng, 16, *hidden, kernel=kernel)
-    inputs = random_inputs(rng, sgm, 600 // side**2, side**2)
+    sgm = random_sgm(rng, 16, *hidden, kernel=kernel, side=side)
+    inputs = random_inputs(rng, sgm, 600 // area(side), area(side))
     inputs[:, :, 0] *= loudness
     sgm.convs[0].weight[:, 0] /= loudness
     gradient, clipped = integer_forward(quantize_sgm(sgm, seen_ranges(sgm, inputs), bits), inputs)
@@ -432,7 +449,7 @@ def test_zero_has_an_exact_code_in_a_range_that_covers_the_given_one(
 
 def test_what_lies_around_a_map_is_zero_to_the_last_digit() -> None:
     # Weights that only see the frame: any code but that of zero would show.
-    sgm = random_sgm(np.random.default_rng(8), 2, 4, kernel=3)
+    sgm = random_sgm(np.random.default_rng(8), 2, 4, kernel=(3, 3))
     low, high = np.array([0.5, 0, 0, -1, -1]), np.array([3, 2, 1, 1, 1])
     sgm.convs[0].weight[:] = 0
     sgm.convs[0].weight[:, :, 0, 0] = 1
