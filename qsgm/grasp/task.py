@@ -1,6 +1,7 @@
 """The grasping task: whether a crop shows the object at its middle, and how it lies."""
 
 from dataclasses import dataclass
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -52,16 +53,20 @@ class GraspTask:
         )
 
     def scores(self, outputs: Array, labels: Array) -> dict[str, float]:
-        """Detection accuracy, and the angle's mean error over positives, modulo 180 degrees."""
+        """Detection accuracy, and the angle's mean error over positives, modulo 180 degrees.
+
+        Without a positive there is no error: NaN.
+        """
         positive = labels[:, QUALITY] > 0
         detected = outputs[:, QUALITY] > DETECTION_THRESHOLD
         seen, true = (
             decode_angle(one[positive, 1], one[positive, 2], self.encoding)
             for one in (outputs, labels)
         )
+        error = np.degrees(angle_error(seen, true))
         return {
             "detection_accuracy": float(np.mean(detected == positive)),
-            "angle_mae_deg": float(np.mean(np.degrees(angle_error(seen, true)))),
+            "angle_mae_deg": float(np.mean(error)) if positive.any() else nan,
         }
 
     def to_json(self) -> dict[str, Any]:

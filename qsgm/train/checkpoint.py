@@ -23,7 +23,7 @@ from qsgm.train.model.sgm import Sgm
 
 FORMAT = "qsgm-checkpoint"
 VERSION = 3
-LARGEST_BYTES = 64 * 2**20
+LARGEST_BYTES, FLOAT_BYTES = 64 * 2**20, 4
 # Of what is not numbers: one byte there can become a hundred in memory. The shipped one has 22 KB.
 LARGEST_PICKLE_BYTES = 2**20
 MOST_HIDDEN, WIDEST_HIDDEN = 4, 1024
@@ -175,7 +175,7 @@ def _task(data: dict[str, Any]) -> TaskRecord:
     )
     if output_count(record.heads) != record.network.outputs:
         raise ValueError("the heads are not the network's")
-    if sum(layer.weights for layer in record.network.layers) > LARGEST_BYTES:
+    if FLOAT_BYTES * sum(layer.weights for layer in record.network.layers) > LARGEST_BYTES:
         raise ValueError("the network has more weights than a checkpoint could hold")
     return record
 

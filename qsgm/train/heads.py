@@ -207,19 +207,24 @@ def meta_objective(heads: Sequence[Head], raw: Tensor, labels: Tensor) -> Tensor
 
     The mean of losses that are logarithms, and the root of a mean squared error, so that a tenth of
     it gone counts the same at a fine object as at a poor one. The plain loss listens to tasks whose
-    error cannot be lowered, and hardly to what is nearly right.
+    error cannot be lowered, and hardly to what is nearly right. Squared errors of heads that weigh
+    the same and count in the same samples are those of one vector.
     """
     total = raw.new_zeros(raw.shape[0])
+    squared: dict[tuple[float, int | None], Tensor] = {}
     for head, place in zip(heads, channels_of(heads), strict=True):
         some = slice(place.start, place.stop)
         value = LOSSES[head.kind].value(head, raw[..., some], labels[..., some])
         gate = labels.new_ones(value.shape) if head.where is None else labels[..., head.where]
-        mean = (value * gate).sum(dim=1)
+        summed = (value * gate).sum(dim=1)
         if head.kind == "squared":
-            mean = (mean / gate.sum(dim=1).clamp(min=1.0) + SMALLEST_ERROR).sqrt()
+            mean = summed / gate.sum(dim=1).clamp(min=1.0)
+            vector = head.weight, head.where
+            squared[vector] = squared[vector] + mean if vector in squared else mean
         else:
-            mean = mean / value.shape[1]
-        total = total + head.weight * mean
+            total = total + head.weight * (summed / value.shape[1])
+    for (weight, _), mean in squared.items():
+        total = total + weight * (mean + SMALLEST_ERROR).sqrt()
     return total
 
 

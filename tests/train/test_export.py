@@ -1,5 +1,6 @@
 """From checkpoint to bundle: it loads, it holds the numbers, and nothing else is left behind."""
 
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,16 +19,23 @@ from qsgm import QsgmError
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.grasp.network import GRASPNET
-from qsgm.grasp.task import GraspTask
+from qsgm.grasp.task import GraspTask, distractors_of, task_of
 from qsgm.grasp.tuned import ObjectDescription, save_object
 from qsgm.manifest import NETWORK, Recipe
 from qsgm.schedule import BATCH
+from qsgm.task import task_record
 from qsgm.train import export
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
+from qsgm.train.export import ExportOptions
 from qsgm.train.export_report import ExportReport
 from qsgm.train.graphs.inspection import refuse_float_products
+<<<<<<< HEAD
 from qsgm.train.graphs.memory import step_memory
 from qsgm.train.grasp.calibration_set import CalibrationSet
+=======
+from qsgm.train.grasp import export as grasp_export
+from qsgm.train.grasp.calibration_set import CalibrationLessons, CalibrationSet
+>>>>>>> 0551336 (Tests of pretraining, calibration, trunk and export on the new API; what they found is mended)
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.grasp.export import fold_and_quantize
@@ -79,14 +87,17 @@ class Workplace:
         self.folder = folder
         torch.manual_seed(0)
         self.net = ConvNet(GRASPNET).eval()
-        sgms = {layer: Sgm(layer, (8, 6)).eval() for layer in (4, 5)}
-        self.checkpoint = Checkpoint(self.net, sgms, {}, GraspTask(), RATES, {"seed": 11})
+        sgms = {layer: Sgm(GRASPNET, layer, (8, 6)).eval() for layer in (4, 5)}
+        self.checkpoint = Checkpoint(
+            task_record(GraspTask()), self.net, sgms, {}, RATES, {"seed": 11}
+        )
         save_checkpoint(folder / "sgm.pt", self.checkpoint)
         draw_calibration_set(folder / "calib", count=2, seed=5)
 
     def export(self, name: str) -> ExportReport:
         paths = (self.folder / part for part in ("sgm.pt", "calib", name))
-        return fold_and_quantize(*paths, ignore, epochs=1, blocks=[parse_blocks("4-5,6")])
+        options = ExportOptions(epochs=1, blocks=(parse_blocks("4-5,6"),))
+        return fold_and_quantize(*paths, ignore, options)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -117,18 +128,18 @@ def bundle(report: ExportReport) -> Bundle:
 
 def test_the_bundle_holds_every_graph_and_nothing_else(bundle: Bundle) -> None:
     data = {"weights.bin", "distractors.png"}
-    assert set(bundle.manifest["files"]) == GRAPHS | data
+    assert set(bundle.manifest.files) == GRAPHS | data
     others = {"manifest.json", "README.md", "SHA256SUMS"}
     assert {path.name for path in bundle.folder.iterdir()} == GRAPHS | data | others
     for name in GRAPHS:
-        entry = bundle.manifest["files"][name]
-        assert entry["bytes"] == (bundle.folder / name).stat().st_size
-        assert ("peak_activation_bytes" in entry) == name.startswith("step")
+        entry, data = bundle.manifest.files[name], (bundle.folder / name).read_bytes()
+        assert entry.sha256 == hashlib.sha256(data).hexdigest()
+        assert (entry.peak_activation_bytes is not None) == name.startswith("step")
         onnx.checker.check_model(onnx.load(bundle.folder / name), full_check=True)
 
 
 def test_the_bundle_brings_the_things_that_ship(bundle: Bundle) -> None:
-    things = bundle.distractors()
+    things = distractors_of(bundle)
     assert things is not None
     assert (len(things), things.named) == (24, 0)
     assert (bundle.folder / "distractors.png").read_bytes() == distractor_file(SHEET_SEED)
@@ -137,10 +148,11 @@ def test_the_bundle_brings_the_things_that_ship(bundle: Bundle) -> None:
 def test_the_checkpoints_decision_goes_into_the_manifest(workplace: Workplace) -> None:
     trainee = calibration_runs.prepare(workplace.checkpoint)
     files = {NETWORK: (workplace.folder / "first" / NETWORK).read_bytes()}
-    assert "decision" not in export.describe(trainee, [], files)
-    decided = replace(trainee, checkpoint=replace(trainee.checkpoint, decision=by_correlation()))
-    described = export.describe(decided, [], files)
-    assert described["decision"] == by_correlation().to_json()
+    assert "decision" not in export.describe(trainee, [], files, {}).to_json()["task"]
+    task = task_record(GraspTask(decision=by_correlation()))
+    decided = replace(trainee, checkpoint=replace(trainee.checkpoint, task=task))
+    described = export.describe(decided, [], files, {}).to_json()
+    assert described["task"]["decision"] == by_correlation().to_json()
 
 
 def test_the_manifest_says_what_memory_steps_take(bundle: Bundle) -> None:
@@ -150,25 +162,29 @@ def test_the_manifest_says_what_memory_steps_take(bundle: Bundle) -> None:
 
 
 def test_the_manifest_gives_the_loss_and_the_recipes(bundle: Bundle) -> None:
-    assert (bundle.encoding, bundle.label_smoothing, bundle.most_layers) == ("double", 0.05, 3)
-    assert bundle.blocks == ("6", "5,6", "4,5,6", "4,5-6", "4-5,6")
+    assert task_of(bundle) == GraspTask("double", 0.05)
+    assert bundle.manifest.heads == GraspTask("double", 0.05).heads
+    assert bundle.manifest.most_layers == 3
+    assert bundle.manifest.blocks == ("6", "5,6", "4,5,6", "4,5-6", "4-5,6")
     for text in ("5,6", "4,5,6", "4-5,6"):
         blocks = parse_blocks(text)
-        tuned = len(blocks.layers)
-        assert bundle.recipe("sgm", tuned, None, blocks) == Recipe("sgd", RATES[text])
+        tuned, layers = len(blocks.layers), blocks.layers
+        assert bundle.recipe("sgm", layers, None, blocks) == Recipe("sgd", RATES[text])
         if text != "4-5,6":
-            assert bundle.recipe("sgm", tuned, "adam", blocks).rates == (2e-3,) * tuned
+            assert bundle.recipe("sgm", layers, "adam", blocks).rates == (2e-3,) * tuned
     # Without rates of their own, blocks get those of as many layers on their own.
-    assert bundle.recipe("sgm", 3, None, parse_blocks("4,5-6")).rates == RATES["4,5,6"]
-    assert bundle.recipe("sgm", 3, None).rates == RATES["4,5,6"]
-    assert bundle.recipe("sgm", 1, None) == Recipe("sgd", RATES["6"])
-    assert bundle.recipe("bp", 1, None) == Recipe("adam", (1e-3,))
-    assert bundle.recipe("bp", 3, None).rates == (1e-3,) * 3
-    assert bundle.recipe("bp", 3, "sgd").rates == (1e-2,) * 3
+    assert (
+        bundle.recipe("sgm", GRASPNET.last(3), None, parse_blocks("4,5-6")).rates == RATES["4,5,6"]
+    )
+    assert bundle.recipe("sgm", GRASPNET.last(3), None).rates == RATES["4,5,6"]
+    assert bundle.recipe("sgm", GRASPNET.last(1), None) == Recipe("sgd", RATES["6"])
+    assert bundle.recipe("bp", GRASPNET.last(1), None) == Recipe("adam", (1e-3,))
+    assert bundle.recipe("bp", GRASPNET.last(3), None).rates == (1e-3,) * 3
+    assert bundle.recipe("bp", GRASPNET.last(3), "sgd").rates == (1e-2,) * 3
 
 
 def test_start_weights_are_the_folded_checkpoints(workplace: Workplace, bundle: Bundle) -> None:
-    weights = bundle.start_weights(3)
+    weights = bundle.start_weights(GRASPNET.last(3))
     folded = fold_net(workplace.net)
     assert len(weights) == 6
     for number in (4, 5, 6):
@@ -180,7 +196,7 @@ def test_start_weights_are_the_folded_checkpoints(workplace: Workplace, bundle: 
 
 def test_blocks_of_several_layers_are_trained_with_sgd_only(bundle: Bundle) -> None:
     with pytest.raises(QsgmError, match=r"has no rates for adam on the blocks 4-5,6; .* sgd"):
-        bundle.recipe("sgm", 3, "adam", parse_blocks("4-5,6"))
+        bundle.recipe("sgm", GRASPNET.last(3), "adam", parse_blocks("4-5,6"))
 
 
 @pytest.mark.parametrize("precision", ["int8", "float"])
@@ -197,7 +213,7 @@ def test_exported_steps_train(bundle: Bundle, blocks: str, optimizer: str, preci
     labels = rng.uniform(0, 1, (40, 3)).astype(np.float32)
     start = {
         name: to_step_layout(value) if value.ndim > 1 else value
-        for name, value in bundle.start_weights(tuned).items()
+        for name, value in bundle.start_weights(GRASPNET.last(tuned)).items()
     }
     loop = StepLoop(session, features, labels, start, dict.fromkeys(range(7 - tuned, 7), 1e-2))
     losses = [loop.step(rng.permutation(40)[:32]) for _ in range(5)]
@@ -270,14 +286,14 @@ def test_a_missing_or_altered_graph_is_refused(
 @pytest.mark.parametrize("text", ["3,4-5,6", "4-6", "6"])
 def test_blocks_without_their_sgms_are_refused(text: str) -> None:
     with pytest.raises(QsgmError, match=f"cannot export steps for the blocks {text}: .* 3 layers"):
-        export.exported_blocks(3, [parse_blocks(text)])
+        export.exported_blocks(GRASPNET, 3, [parse_blocks(text)])
 
 
 def test_a_checkpoint_of_six_layers_exports_all_of_them() -> None:
-    texts = [str(blocks) for blocks in export.exported_blocks(6, [])]
-    assert texts[:6] == [str(single_layers(tuned)) for tuned in range(1, 7)]
+    texts = [str(blocks) for blocks in export.exported_blocks(GRASPNET, 6, [])]
+    assert texts[:6] == [str(single_layers(GRASPNET.last(tuned))) for tuned in range(1, 7)]
     assert texts[6:] == ["4,5-6", "3-4,5,6", "2-4,5,6", "1-4,5,6"]
-    assert [str(blocks) for blocks in export.exported_blocks(1, [])] == ["6"]
+    assert [str(blocks) for blocks in export.exported_blocks(GRASPNET, 1, [])] == ["6"]
 
 
 def test_a_failure_leaves_nothing_behind(
@@ -301,17 +317,18 @@ def test_a_folder_with_something_else_is_refused_before_any_work(
     workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(export, "load_checkpoint", pytest.fail)
+    monkeypatch.setattr(grasp_export, "load_checkpoint", pytest.fail)
     with pytest.raises(QsgmError, match=r"it holds another kind of output|did not write"):
         fold_and_quantize(Path("sgm.pt"), Path("calib"), workplace.folder, ignore)
 
 
 def test_folding_that_changes_outputs_is_refused(workplace: Workplace) -> None:
     trainee = calibration_runs.prepare(workplace.checkpoint)
-    frame = CalibrationSet(workplace.folder / "calib")[0]
-    assert export.check_folding(trainee, frame) < 1e-4
+    lessons = CalibrationLessons(CalibrationSet(workplace.folder / "calib"), GraspTask())
+    assert export.check_folding(trainee, lessons) < 1e-4
     trainee.sgms[5].convs[1].bias[0] += 0.1
     with pytest.raises(QsgmError, match="folding batchnorm changes the SGM behind layer 5"):
-        export.check_folding(trainee, frame)
+        export.check_folding(trainee, lessons)
 
 
 def test_a_product_left_in_float_is_refused_with_its_layer(bundle: Bundle) -> None:

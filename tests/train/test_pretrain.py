@@ -12,10 +12,13 @@ import torch
 
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
-from qsgm.grasp.task import GraspTask
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.task import grasp_task
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.grasp.decision import DecisionConfig
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig
+from qsgm.train.grasp.pretrain import DecisionStage, pretrain_grasping
+from qsgm.train.grasp.task import DrawnGrasping
 from qsgm.train.pretraining import pretrain as module
 from qsgm.train.pretraining import rates as rates_module
 from qsgm.train.pretraining import resume as partial_module
@@ -24,7 +27,7 @@ from qsgm.train.pretraining.evaluate import Score
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining
 from qsgm.train.pretraining.map_sgms import MapConfig
 from qsgm.train.pretraining.matching import MatchingConfig
-from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
+from qsgm.train.pretraining.pretrain import PretrainConfig
 from qsgm.train.pretraining.rates import RatesConfig
 from qsgm.train.pretraining.resume import Partial
 
@@ -52,8 +55,12 @@ TINY = PretrainConfig(
         early_crops_per_task=10,
         early_epochs=1,
     ),
-    scenes=DecisionScenesConfig(episodes=2, scenes=2, crops=20, support=16, epochs=1),
-    decision=DecisionConfig(hidden=4, steps=5, folds=2),
+)
+TASK = DrawnGrasping()
+LAST = DecisionStage(
+    TASK,
+    DecisionScenesConfig(episodes=2, scenes=2, crops=20, support=16, epochs=1),
+    DecisionConfig(hidden=4, steps=5, folds=2),
 )
 
 
@@ -70,11 +77,11 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
         assert 0 < done <= total
         stages.append(stage)
 
-    pretrain(tmp_path / "sgm.pt", 3, "cpu", watch, TINY)
+    pretrain_grasping(TASK, tmp_path / "sgm.pt", 3, "cpu", watch, TINY, LAST)
     checkpoint = load_checkpoint(tmp_path / "sgm.pt")
     assert sorted(checkpoint.sgms) == [1, 2, 3, 4, 5]
     assert sorted(checkpoint.curvatures) == [4, 5, 6]
-    singles = {str(single_layers(tuned)): tuned for tuned in range(1, 7)}
+    singles = {str(single_layers(GRASPNET.last(tuned))): tuned for tuned in range(1, 7)}
     blocks = {"3-4,5,6": 4, "2-4,5,6": 5, "1-4,5,6": 6}
     assert {b: len(rates) for b, rates in checkpoint.rates.items()} == singles | blocks
     assert checkpoint.rates["3-4,5,6"][1:] == checkpoint.rates["4,5,6"]
@@ -97,7 +104,9 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
 
 def test_the_same_seed_gives_the_same_checkpoint_and_another_seed_another(tmp_path: Path) -> None:
     nets = [
-        pretrain(tmp_path / f"{i}.pt", seed, "cpu", silent, TINY).net.state_dict()
+        pretrain_grasping(
+            TASK, tmp_path / f"{i}.pt", seed, "cpu", silent, TINY, LAST
+        ).net.state_dict()
         for i, seed in enumerate((0, 0, 1))
     ]
     assert all(torch.equal(a, nets[1][name]) for name, a in nets[0].items())
@@ -111,13 +120,15 @@ def test_an_interrupted_pretraining_goes_on_where_it_stopped(tmp_path: Path) -> 
 
     output = tmp_path / "sgm.pt"
     with pytest.raises(KeyboardInterrupt):
-        pretrain(output, 0, "cpu", interrupt, TINY)
+        pretrain_grasping(TASK, output, 0, "cpu", interrupt, TINY, LAST)
     assert not output.exists()
     stages: set[str] = set()
-    resumed = pretrain(output, 0, "cpu", lambda stage, *_: stages.add(stage), TINY)
+    resumed = pretrain_grasping(
+        TASK, output, 0, "cpu", lambda stage, *_: stages.add(stage), TINY, LAST
+    )
     assert "backbone" not in stages
     assert "matching" not in stages
-    unbroken = pretrain(tmp_path / "other.pt", 0, "cpu", silent, TINY)
+    unbroken = pretrain_grasping(TASK, tmp_path / "other.pt", 0, "cpu", silent, TINY, LAST)
     for name, value in unbroken.net.state_dict().items():
         assert torch.equal(resumed.net.state_dict()[name], value)
     assert resumed.card["resumed"]
@@ -132,7 +143,7 @@ def stop_in_meta(stage: str, *_: object) -> None:
 def interrupted(output: Path) -> Path:
     """The partial of a pretraining with seed 0 that got through its second stage."""
     with pytest.raises(KeyboardInterrupt):
-        pretrain(output, 0, "cpu", stop_in_meta, TINY)
+        pretrain_grasping(TASK, output, 0, "cpu", stop_in_meta, TINY, LAST)
     return output.with_name(output.name + ".partial")
 
 
@@ -144,7 +155,7 @@ def stages_until_meta(output: Path) -> set[str]:
         stop_in_meta(stage)
 
     with pytest.raises(KeyboardInterrupt):
-        pretrain(output, 0, "cpu", watch, TINY)
+        pretrain_grasping(TASK, output, 0, "cpu", watch, TINY, LAST)
     return stages
 
 
@@ -194,7 +205,7 @@ def test_a_partial_with_a_right_digest_and_wrong_content_counts_as_none(
 def test_a_folder_in_the_partials_place_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "sgm.pt.partial").mkdir()
     with pytest.raises(QsgmError, match="exists and is not a file"):
-        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, TINY)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cpu", silent, TINY, LAST)
 
 
 def test_a_partial_of_another_version_is_not_taken_up(
@@ -221,31 +232,40 @@ def test_seconds_are_counted_over_interruptions(
 
 
 def test_the_command_on_the_card_says_every_option_that_is_not_the_default() -> None:
-    plain = module._command(0, "cpu", PretrainConfig(), GraspTask())
+    plain = module._command(0, "cpu", PretrainConfig())
     assert plain == "qsgm pretrain -o sgm.pt --seed 0"
-    other = module._command(3, "cuda", TINY, GraspTask("paper"))
-    assert other.removeprefix("qsgm pretrain -o sgm.pt --seed 3") == (
-        " --device cuda --encoding paper --hidden 8"
-    )
+    other = module._command(3, "cuda", TINY)
+    assert other == "qsgm pretrain -o sgm.pt --seed 3 --device cuda --hidden 8"
+
+
+def test_angles_encoded_as_in_the_paper_are_learnt_and_the_card_says_so(tmp_path: Path) -> None:
+    task = DrawnGrasping("paper")
+    last = replace(LAST, task=task)
+    made = pretrain_grasping(task, tmp_path / "sgm.pt", 0, "cpu", silent, TINY, last)
+    assert made.card["command"] == "qsgm pretrain -o sgm.pt --seed 0 --hidden 8 --encoding paper"
+    loaded = load_checkpoint(tmp_path / "sgm.pt").task
+    assert grasp_task(loaded, "it").encoding == "paper"
+    assert loaded.heads == task.heads
 
 
 def test_the_card_says_where_the_backbone_was_trained(tmp_path: Path) -> None:
     partial = Partial.open(tmp_path / "x", {})
-    card = module._card("qsgm pretrain", "cuda", TINY, Score(0.0, 1.0, 2.0), partial)
+    score = Score(0.0, {"accuracy": 1.0})
+    card = module._card("qsgm pretrain", "cuda", TINY, LAST.to_json(), score, partial)
     assert "backbone on cuda" in module._card_text(tmp_path / "x", card)
 
 
 def test_a_backbone_that_blows_up_leaves_nothing(tmp_path: Path) -> None:
     config = replace(TINY, backbone=replace(TINY.backbone, peak_rate=1e30))
     with pytest.raises(QsgmError, match=r"stage `backbone`: ConvNet .* pass another --seed"):
-        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cpu", silent, config, LAST)
     assert not list(tmp_path.iterdir())
 
 
 def test_sgms_that_blow_up_leave_no_output(tmp_path: Path) -> None:
     config = replace(TINY, matching=replace(TINY.matching, peak_rate=1e30))
     with pytest.raises(QsgmError, match=r"stage `matching`: Sgm .* pass another --seed"):
-        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cpu", silent, config, LAST)
     assert not (tmp_path / "sgm.pt").exists()
 
 
@@ -257,7 +277,7 @@ def test_meta_training_that_blows_up_leaves_no_output(
 
     monkeypatch.setattr(MetaTraining, "run", blow_up)
     with pytest.raises(QsgmError, match="stage `meta`: ConvNet"):
-        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, TINY)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cpu", silent, TINY, LAST)
     assert not (tmp_path / "sgm.pt").exists()
 
 
@@ -267,7 +287,7 @@ def test_rates_that_all_diverge_leave_no_output(
     monkeypatch.setattr(rates_module, "RATE_GRID", (1e38,))
     config = replace(TINY, rates=replace(TINY.rates, epochs=3))
     with pytest.raises(QsgmError, match=r"trial runs .* diverged"):
-        pretrain(tmp_path / "sgm.pt", 0, "cpu", silent, config)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cpu", silent, config, LAST)
     assert [path.name for path in tmp_path.iterdir()] == ["sgm.pt.partial"]
 
 
@@ -291,7 +311,9 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_training(
     (tmp_path / "card.md").mkdir()
     (tmp_path / "file").write_text("")
     with pytest.raises(QsgmError, match=message) as caught:
-        pretrain(tmp_path / name, 0, "cpu", lambda *_: pytest.fail("it was training"), TINY)
+        pretrain_grasping(
+            TASK, tmp_path / name, 0, "cpu", lambda *_: pytest.fail("it was training"), TINY, LAST
+        )
     assert "\n" not in str(caught.value)
 
 
@@ -304,16 +326,18 @@ def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        pretrain(
+        pretrain_grasping(
+            TASK,
             tmp_path / "sgm.pt",
             0,
             "cpu",
             lambda stage, *_: threads.update({stage: torch.get_num_threads()}),
             TINY,
+            LAST,
         )
         after = torch.get_num_threads()
         with pytest.raises(KeyboardInterrupt):
-            pretrain(tmp_path / "other.pt", 0, "cpu", stop_in_meta, TINY)
+            pretrain_grasping(TASK, tmp_path / "other.pt", 0, "cpu", stop_in_meta, TINY, LAST)
         after_interruption = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
@@ -326,14 +350,16 @@ def test_a_partial_of_another_seed_is_not_taken_up(tmp_path: Path) -> None:
     output = tmp_path / "sgm.pt"
     first = replace(TINY, maml=replace(TINY.maml, outer_steps=1))
     with pytest.raises(ZeroDivisionError):
-        pretrain(output, 0, "cpu", lambda stage, *_: 1 // (stage != "meta"), first)
+        pretrain_grasping(
+            TASK, output, 0, "cpu", lambda stage, *_: 1 // (stage != "meta"), first, LAST
+        )
     stages: set[str] = set()
-    pretrain(output, 1, "cpu", lambda stage, *_: stages.add(stage), first)
+    pretrain_grasping(TASK, output, 1, "cpu", lambda stage, *_: stages.add(stage), first, LAST)
     assert "backbone" in stages
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_a_device_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(QsgmError, match="--device cpu"):
-        pretrain(tmp_path / "sgm.pt", 0, "cuda", silent, TINY)
+        pretrain_grasping(TASK, tmp_path / "sgm.pt", 0, "cuda", silent, TINY, LAST)
     assert not list(tmp_path.iterdir())

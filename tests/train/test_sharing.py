@@ -61,6 +61,6 @@ def test_every_place_is_aligned_and_an_array_is_read_back_from_its_own() -> None
     places = [shared.add_array(array) for array in [*arrays, arrays[1]]]
     assert places[3] == places[1]
     for array, place in zip(arrays, places, strict=False):
-        assert place["offset"] % ALIGNMENT == 0
-        found = np.frombuffer(shared.data, "<f4", count=array.size, offset=place["offset"])
-        np.testing.assert_array_equal(found.reshape(place["shape"]), array)
+        assert place.offset % ALIGNMENT == 0
+        found = np.frombuffer(shared.data, "<f4", count=array.size, offset=place.offset)
+        np.testing.assert_array_equal(found.reshape(place.shape), array)

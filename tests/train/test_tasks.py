@@ -143,3 +143,9 @@ def test_recorded_examples_hold_true_gradients_and_an_sgm_learns_them() -> None:
         given.flatten(), examples[5].gradients.flatten(), dim=0
     )
     assert alike > 0.9
+
+
+def test_without_a_positive_there_is_no_angle_to_be_wrong() -> None:
+    scores = GraspTask().scores(np.full((4, 3), 0.2, np.float32), np.zeros((4, 3), np.float32))
+    assert scores["detection_accuracy"] == 1
+    assert np.isnan(scores["angle_mae_deg"])

@@ -13,11 +13,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nets import random_net
-from qsgm.train.quantization.calibration_set import Demonstration
 
 from qsgm import QsgmError
 from qsgm.blocks import one_block, single_layers
+from qsgm.grasp.network import GRASPNET
+from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask
+from qsgm.network import Layer, Network, conv
 from qsgm.runtime import session_options
 from qsgm.sgm.float import FloatArray
 from qsgm.train.graphs.build import Graph
@@ -30,11 +32,12 @@ from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.step import step_model
 from qsgm.train.graphs.trunk import int8_layer, int8_trunk_model, trunk_model
-from qsgm.train.grasp.calibration_set import CalibrationSet
+from qsgm.train.grasp.calibration_set import CalibrationLessons, CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
+from qsgm.train.grasp.task import shipped_things
 from qsgm.train.model.arrays import FoldedLayer, FoldedNet
 from qsgm.train.model.fold import fold_net, fold_sgm
-from qsgm.train.model.net import normalize
+from qsgm.train.model.net import as_seen
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.quantization import trunk_ranges
 from qsgm.train.quantization.trunk import (
@@ -45,22 +48,24 @@ from qsgm.train.quantization.trunk import (
     quantize_trunk,
     u8_steps,
 )
-from qsgm.train.quantization.trunk_ranges import (
-    calibration_crops,
-    join,
-    observe_crops,
-    observe_trunk,
-)
+from qsgm.train.quantization.trunk_ranges import join, observe_samples, observe_trunk
 from qsgm.weights import to_step_layout
 
 ALL, NONE = ort.GraphOptimizationLevel.ORT_ENABLE_ALL, ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 FROZEN = pytest.mark.parametrize("last_frozen", range(1, 6))
 Codes = np.ndarray[Any, np.dtype[np.uint8]]
+HEADS = GraspTask().heads
+
+
+def calibration_crops(shown: Demonstration, rng: np.random.Generator, count: int) -> Codes:
+    """Crops (N, 128, 128, 3) of one frame, as the device cuts them."""
+    return crop_source([shown], shipped_things(), rng, count).cut(np.arange(count))
 
 
 @pytest.fixture(scope="module")
 def crops(frame: Codes) -> Codes:
-    return calibration_crops(Demonstration(frame, (320, 240)), np.random.default_rng(0))[:40]
+    shown = Demonstration(frame, (320, 240))
+    return calibration_crops(shown, np.random.default_rng(0), 200)[:40]
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +74,13 @@ def drawn_net(crops: Codes) -> FoldedNet:
     net = random_net(0).train()
     with torch.no_grad():
         for _ in range(20):
-            net(normalize(torch.from_numpy(crops)))
+            net(as_seen(GRASPNET, torch.from_numpy(crops)))
     return fold_net(net.eval())
 
 
 @pytest.fixture(scope="module")
 def ranges(drawn_net: FoldedNet, crops: Codes) -> dict[int, LayerRange]:
-    seen = dict(observe_crops(drawn_net, crops))
+    seen = dict(observe_samples(drawn_net, crops))
     # In front of the pool and behind it a step is to stand for different things.
     return seen | {4: replace(seen[4], convolved=3 * seen[4].convolved)}
 
@@ -103,31 +108,39 @@ def to_u8(x: np.ndarray) -> Codes:
     return np.clip(np.rint(x), 0, 255).astype(np.uint8)
 
 
-def integer_layer(layer: QuantizedLayer, x: Codes) -> Codes:
+def integer_layer(one: Layer, layer: QuantizedLayer, x: Codes) -> Codes:
     """u8 maps (N, Ci, H, W) to u8 maps: sums in integers, two roundings in float32."""
-    side, stride = layer.weight.shape[2], layer.stride
-    windows = np.lib.stride_tricks.sliding_window_view(x, (side, side), axis=(2, 3))
-    windows = windows[:, :, ::stride, ::stride].astype(np.float64)  # holds these integers exactly
+    (up, left), (down, right) = one.padding, one.stride
+    x = np.pad(x, ((0, 0), (0, 0), (up, up), (left, left)))
+    windows = np.lib.stride_tricks.sliding_window_view(x, one.kernel, axis=(2, 3))
+    windows = windows[:, :, ::down, ::right].astype(np.float64)  # holds these integers exactly
     sums = np.einsum("nihwyx,oiyx->nohw", windows, layer.weight.astype(np.float64), optimize=True)
     sums += layer.bias[:, None, None]
     assert np.abs(sums).max() < 2**31
     codes = to_u8(sums.astype(np.float32) * layer.scale[:, None, None])
     if layer.pool_gain is None:
         return codes
-    total = codes.sum(axis=(2, 3), keepdims=True, dtype=np.int64).astype(np.float32)
+    (down, right), pooled = one.pool_stride, np.lib.stride_tricks.sliding_window_view
+    windows = pooled(codes, one.pool, axis=(2, 3))[:, :, ::down, ::right]
+    total = windows.sum(axis=(4, 5), dtype=np.int64).astype(np.float32)
     return to_u8(total * layer.pool_gain[:, None, None])
 
 
-def integer_trunk(layers: dict[int, QuantizedLayer], crops: Codes, last_frozen: int) -> Codes:
-    """Crops (N, 128, 128, 3) to features (N, P, C)."""
+def integer_trunk(
+    layers: dict[int, QuantizedLayer],
+    crops: Codes,
+    last_frozen: int,
+    network: Network = GRASPNET,
+) -> Codes:
+    """Samples (N, H, W, C) to features (N, P, C)."""
     x = crops.transpose(0, 3, 1, 2)
     for number in range(1, last_frozen + 1):
-        x = integer_layer(layers[number], x)
+        x = integer_layer(network.layer(number), layers[number], x)
     return x.reshape(*x.shape[:2], -1).transpose(0, 2, 1)
 
 
 def float_features(net: FoldedNet, crops: Codes, last_frozen: int) -> FloatArray:
-    return run(trunk_model(replace(net, feature_steps={}), last_frozen), crops=crops)[0]
+    return run(trunk_model(replace(net, feature_steps={}), last_frozen), samples=crops)[0]
 
 
 def sqnr_db(exact: np.ndarray, rounded: np.ndarray) -> float:
@@ -158,29 +171,27 @@ def test_onnx_runtime_computes_an_int8_layer_bit_for_bit(
     size = (*shape, kernel, kernel)
     weight = rng.normal(size=size) * np.exp(rng.normal(size=(shape[0], 1, 1, 1)))
     folded = FoldedLayer(
-        weight.astype(np.float32),
-        (bias * rng.normal(size=shape[0])).astype(np.float32),
-        stride,
-        relu=True,
-        pool=out if pool else 1,
+        weight.astype(np.float32), (bias * rng.normal(size=shape[0])).astype(np.float32)
     )
+    side_after = 1 if pool else out
+    geometry = conv(shape[1], shape[0], kernel, stride=stride, pool=out if pool else 1)
+    behind = conv(shape[0], 1, side_after, relu=False)
     high = np.exp(rng.normal(size=(2, shape[0]))).astype(np.float32) * kernel**2
-    one = FoldedNet((folded,))
+    one = FoldedNet(Network((side, side, shape[1]), (geometry, behind)), (folded,))
     layer = quantize_trunk(one, {1: LayerRange(high[0], high[1] if pool else high[0])})[1]
     graph = Graph("layer")
     maps = graph.input("x", np.uint8, ("n", shape[1], side, side))
-    codes = int8_layer(graph.within("layer1"), layer, maps)
-    side_after = 1 if pool else out
+    codes = int8_layer(graph.within("layer1"), one, 1, layer, maps)
     graph.output("codes", codes, np.uint8, ("n", shape[0], side_after, side_after))
     x = rng.integers(0, 256, (3, shape[1], side, side), dtype=np.uint8)
-    np.testing.assert_array_equal(run(graph.model(), x=x)[0], integer_layer(layer, x))
+    np.testing.assert_array_equal(run(graph.model(), x=x)[0], integer_layer(geometry, layer, x))
 
 
 @FROZEN
 def test_onnx_runtime_computes_the_int8_trunk_bit_for_bit(
     net: FoldedNet, layers: dict[int, QuantizedLayer], crops: Codes, last_frozen: int
 ) -> None:
-    (got,) = run(int8_trunk_model(net, layers, last_frozen), crops=crops)
+    (got,) = run(int8_trunk_model(net, layers, last_frozen), samples=crops)
     expected = integer_trunk(layers, crops, last_frozen)
     assert len(np.unique(expected)) > 10
     np.testing.assert_array_equal(got, expected)
@@ -190,7 +201,7 @@ def test_onnx_runtime_computes_the_int8_trunk_bit_for_bit(
 def test_without_graph_optimizations_few_features_differ_and_by_few_steps(
     net: FoldedNet, layers: dict[int, QuantizedLayer], crops: Codes, last_frozen: int
 ) -> None:
-    (got,) = run(int8_trunk_model(net, layers, last_frozen), NONE, crops=crops)
+    (got,) = run(int8_trunk_model(net, layers, last_frozen), NONE, samples=crops)
     expected = integer_trunk(layers, crops, last_frozen)
     # In float a sum near a half may round to the next code, and later layers add such steps up.
     moved = np.abs(got.astype(int) - expected)
@@ -208,10 +219,12 @@ def test_every_convolution_of_the_int8_trunk_runs_in_integers(
     assert "Conv" not in {node.op_type for node in optimized_nodes(model)}
 
 
-def test_a_trunk_with_a_convolution_in_float_is_refused(layers: dict[int, QuantizedLayer]) -> None:
+def test_a_trunk_with_a_convolution_in_float_is_refused(
+    net: FoldedNet, layers: dict[int, QuantizedLayer]
+) -> None:
     graph = Graph("trunk")
     x = graph.input("x", np.uint8, ("n", 3, 9, 9))
-    int8_layer(graph.within("layer1"), layers[1], x)
+    int8_layer(graph.within("layer1"), net, 1, layers[1], x)
     conv = next(node for node in graph.nodes if node.op_type == "Conv")
     del graph.nodes[graph.nodes.index(conv) + 1 :]  # no longer rounded: nothing to fuse it with
     graph.output("y", conv.output[0], np.float32, ("n", 8, 3, 3))
@@ -223,7 +236,7 @@ def test_a_trunk_with_a_convolution_in_float_is_refused(layers: dict[int, Quanti
 def test_u8_features_of_the_float_trunk_are_its_float_features_rounded(
     net: FoldedNet, crops: Codes, last_frozen: int
 ) -> None:
-    (got,) = run(trunk_model(net, last_frozen), crops=crops)
+    (got,) = run(trunk_model(net, last_frozen), samples=crops)
     exact = float_features(net, crops, last_frozen) / net.feature_steps[last_frozen]
     assert got.dtype == np.uint8
     # A float32 sum in another order may end on the other side of a half.
@@ -245,12 +258,12 @@ def test_rounding_the_first_layers_weights_costs_nothing_on_grey_pixels(net: Fol
     first = net.layers[0]
     bias = np.full(8, 1.2, np.float32)  # in the middle of the codes
     high = np.full(8, 0.01 * 255 / HEADROOM, np.float32)  # fine steps, so that errors show
-    bright = FoldedNet((replace(first, bias=bias),))
+    bright = replace(net, layers=(replace(first, bias=bias), *net.layers[1:]))
     layer = quantize_trunk(bright, {1: LayerRange(high, high)})[1]
     for value in (127, 128):
         grey = np.full((1, 3, 5, 5), value, np.uint8)
         exact = bias + first.weight.sum(axis=(1, 2, 3)) * (value / 127.5 - 1)
-        codes = integer_layer(layer, grey)[0, :, 0, 0]
+        codes = integer_layer(GRASPNET.layer(1), layer, grey)[0, :, 0, 0]
         np.testing.assert_allclose(codes, exact / 0.01, atol=0.6)
 
 
@@ -258,14 +271,15 @@ def test_rounding_the_first_layers_weights_costs_nothing_on_grey_pixels(net: Fol
 def test_a_step_trains_on_u8_features_as_on_their_values_in_float(
     net: FoldedNet, tuned: int
 ) -> None:
-    rng, loss = np.random.default_rng(tuned), GraspTask()
+    rng = np.random.default_rng(tuned)
     torch.manual_seed(0)
-    sgms = {k: fold_sgm(Sgm(k, (8,)).eval()) for k in range(7 - tuned, 6)}
-    blocks = single_layers(tuned) if tuned > 1 else one_block(1)
+    sgms = {k: fold_sgm(Sgm(GRASPNET, k, (8,)).eval()) for k in range(7 - tuned, 6)}
+    last = GRASPNET.last(tuned)
+    blocks = single_layers(last) if tuned > 1 else one_block(last)
     codes, labels, rows = random_batch(net, tuned, rng)
     feeds = {"labels": labels, "rows": rows} | start(net, tuned)
     feeds |= {f"rate{k}": np.array(1e-3, np.float32) for k in range(7 - tuned, 7)}
-    model = step_model(net, blocks, sgms, loss, Sgd())
+    model = step_model(net, blocks, sgms, HEADS, Sgd())
     for wanted in model.graph.input:
         if "_" in wanted.name:  # a moment
             shape = [side.dim_value for side in wanted.type.tensor_type.shape.dim]
@@ -273,7 +287,7 @@ def test_a_step_trains_on_u8_features_as_on_their_values_in_float(
     got = run(model, features=codes, **feeds)
     values = codes * net.feature_steps[6 - tuned]
     plain = replace(net, feature_steps={})
-    expected = run(step_model(plain, blocks, sgms, loss, Sgd()), features=values, **feeds)
+    expected = run(step_model(plain, blocks, sgms, HEADS, Sgd()), features=values, **feeds)
     # Not bit for bit: the graph multiplies the weights, not the codes, with the steps.
     for one, other in zip(got, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())
@@ -282,9 +296,9 @@ def test_a_step_trains_on_u8_features_as_on_their_values_in_float(
 @pytest.mark.parametrize("tuned", range(1, 6))
 def test_a_head_sees_u8_features_as_their_values_in_float(net: FoldedNet, tuned: int) -> None:
     codes, _, _ = random_batch(net, tuned, np.random.default_rng(tuned))
-    got = run(head_model(net, tuned, "double"), features=codes, **start(net, tuned))
+    got = run(head_model(net, tuned, HEADS), features=codes, **start(net, tuned))
     values, plain = codes * net.feature_steps[6 - tuned], replace(net, feature_steps={})
-    expected = run(head_model(plain, tuned, "double"), features=values, **start(net, tuned))
+    expected = run(head_model(plain, tuned, HEADS), features=values, **start(net, tuned))
     np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-5)
 
 
@@ -311,12 +325,13 @@ def start(net: FoldedNet, tuned: int) -> dict[str, np.ndarray]:
 def test_ranges_are_the_largest_activations_on_all_frames(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(trunk_ranges, "CROPS", 30)
+    monkeypatch.setattr(trunk_ranges, "SAMPLES", 30)
     draw_calibration_set(tmp_path / "calib", 2, 0, lambda *_: None)
     frames, net = CalibrationSet(tmp_path / "calib"), random_net(0)
-    got = observe_trunk(fold_net(net), frames, 5, lambda *_: None)
-    crops = [calibration_crops(frames[i], np.random.default_rng([5, i])) for i in range(2)]
-    x = normalize(torch.tensor(np.concatenate(crops)))
+    lessons = CalibrationLessons(frames, GraspTask())
+    got = observe_trunk(fold_net(net), lessons, 5, lambda *_: None)
+    crops = [calibration_crops(frames[i], np.random.default_rng([5, i]), 30) for i in range(2)]
+    x = as_seen(GRASPNET, torch.tensor(np.concatenate(crops)))
     with torch.no_grad():
         for number in range(1, 6):
             layer = net.layers[number - 1]
@@ -328,12 +343,13 @@ def test_ranges_are_the_largest_activations_on_all_frames(
 
 
 def test_one_frame_is_in_memory_at_a_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(trunk_ranges, "CROPS", 2)
+    monkeypatch.setattr(trunk_ranges, "SAMPLES", 2)
     draw_calibration_set(tmp_path / "calib", 3, 0, lambda *_: None)
     events: list[str] = []
     spied(monkeypatch, CalibrationSet, "__getitem__", lambda: events.append("read"))
-    spied(monkeypatch, trunk_ranges, "observe_crops", lambda: events.append("observed"))
-    observe_trunk(fold_net(random_net(0)), CalibrationSet(tmp_path / "calib"), 0, lambda *_: None)
+    spied(monkeypatch, trunk_ranges, "observe_samples", lambda: events.append("observed"))
+    lessons = CalibrationLessons(CalibrationSet(tmp_path / "calib"), GraspTask())
+    observe_trunk(fold_net(random_net(0)), lessons, 0, lambda *_: None)
     assert events == ["read", "observed"] * 3
 
 

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+from qsgm.files import check_replaceable
 from qsgm.grasp.distractors import FILE as DISTRACTORS
 from qsgm.grasp.task import grasp_task
+from qsgm.manifest import WEIGHTS
 from qsgm.progress import Progress
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.export import ExportOptions, export_bundle
@@ -31,6 +33,7 @@ def fold_and_quantize(
     Raises:
         QsgmError: as :func:`qsgm.train.export.export_bundle`; or it is another task's checkpoint.
     """
+    check_replaceable(output_folder, WEIGHTS)
     task = grasp_task(load_checkpoint(checkpoint_path).task, str(checkpoint_path))
     lessons = CalibrationLessons(CalibrationSet(calib_folder), task)
     things = {DISTRACTORS: distractor_file(SHEET_SEED)}
