@@ -84,8 +84,11 @@ class HeadsLoss:
                     x, classes, reduction="none", label_smoothing=head.smoothing
                 )
             elif head.kind == "log_loss":
-                target = torch.where(known > 0.5, 1 - head.smoothing / 2, head.smoothing / 2)
-                value = F.binary_cross_entropy_with_logits(x, target.to(x), reduction="none")
+                near, far = (
+                    x.new_tensor(end) for end in (head.smoothing / 2, 1 - head.smoothing / 2)
+                )
+                target = torch.where(known > 0.5, far, near)
+                value = F.binary_cross_entropy_with_logits(x, target, reduction="none")
                 value = value.sum(dim=1)
             else:
                 seen = ACTIVATIONS[head.activation](x)

@@ -264,7 +264,7 @@ def build_trunks(
     """The frozen layers when the last `tuned` are tuned; if none are, there is one precision."""
     layers, last_frozen = net.network.last(tuned), net.network.depth - tuned
     trunks = {trunk_file("float", layers): trunk_model(net, last_frozen)}
-    if last_frozen > 0 and int8_trunk:
+    if last_frozen in int8_trunk:
         trunks[trunk_file("int8", layers)] = int8_trunk_model(net, int8_trunk, last_frozen)
     return trunks
 

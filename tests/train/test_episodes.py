@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from losses import GraspLoss
 
 from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.network import GRASPNET
@@ -13,7 +14,7 @@ from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, best_score, f
 from qsgm.train.grasp.decision_scenes import heatmap_of
 from qsgm.train.grasp.episodes import USUAL, EpisodeMaker
 from qsgm.train.model.fold import folded_start
-from qsgm.train.model.net import ConvNet, normalize
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.pretraining.tasks import start_states
 
 
@@ -70,11 +71,12 @@ def test_the_decision_finds_what_the_evidence_shows_and_raises_few_false_alarms(
 
 def test_a_heatmap_by_folded_layers_is_the_networks_own() -> None:
     torch.manual_seed(0)
-    net, loss = ConvNet(GRASPNET).eval(), GraspTask()
+    net, task = ConvNet(GRASPNET).eval(), GraspTask()
     frame = np.random.default_rng(0).integers(0, 255, (176, 160, 3)).astype(np.uint8)
     with torch.no_grad():
-        expected = loss.activate(net(normalize(torch.from_numpy(frame[None]))))[0].numpy()
+        raw = net(as_seen(GRASPNET, torch.from_numpy(frame[None])))
+        expected = GraspLoss().activate(raw)[0].numpy()
     states = start_states(folded_start(net, 3), 1)
-    got = heatmap_of(net, states, frame, loss)
+    got = heatmap_of(net, states, frame, task.heads)
     assert got.shape == (3, 4, 3)
     np.testing.assert_allclose(got, expected, atol=1e-5)

@@ -92,7 +92,7 @@ def through_activation(network: Network, number: int, before: Tensor, gradient: 
     """The gradient on a layer's activation carried back to its pre-activation."""
     layer = network.layer(number)
     if network.pools_all(number):
-        gradient = gradient / before.shape[2]
+        gradient = (gradient / before.shape[2]).expand_as(before)
     elif layer.pool != ONE:
         index = pool_index(network, number)
         share = (gradient / index.shape[1])[:, :, :, None].expand(-1, -1, -1, index.shape[1], -1)

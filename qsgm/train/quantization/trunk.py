@@ -62,7 +62,7 @@ def u8_steps(high: FloatArray) -> FloatArray:
 
 
 def quantize_trunk(net: FoldedNet, ranges: Mapping[int, LayerRange]) -> dict[int, QuantizedLayer]:
-    """The layers that can be frozen, in int8, by number.
+    """The layers that can be frozen, in int8, by number: up to the first without a ReLU.
 
     Args:
         net: on pixels in [-1, 1].
@@ -73,8 +73,10 @@ def quantize_trunk(net: FoldedNet, ranges: Mapping[int, LayerRange]) -> dict[int
         return {}
     # A channel's value is `step` times what its code has above `zero`.
     step, zero = np.full(net.layers[0].weight.shape[1], PIXEL_SCALE), -PIXEL_OFFSET / PIXEL_SCALE
-    layers = {}
+    layers: dict[int, QuantizedLayer] = {}
     for number, seen in sorted(ranges.items()):
+        if number != len(layers) + 1:  # what lies before it has no codes
+            break
         folded, layer = net.layers[number - 1], net.network.layer(number)
         # The weights absorb the very steps that the graphs use, rounded to float32 as they are.
         out, pooled = (u8_steps(high).astype(np.float64) for high in (seen.convolved, seen.pooled))
