@@ -138,7 +138,7 @@ def test_a_step_graph_steps_as_torch(case: Case, optimizer: Optimizer, data: st.
         "labels": case.labels(CROPS),
     }
     loss = HeadsLoss(case.heads)
-    compare_steps(case.net, blocks, case.sgms(), loss, optimizer, 5, arrays)
+    compare_steps(case.net, blocks, case.sgms(), loss, optimizer, 5, arrays, terms=1.0)
 
 
 def quantized(case: Case, sgm: FoldedSgm, seen: np.ndarray) -> QuantizedSgm:
