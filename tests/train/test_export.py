@@ -29,13 +29,9 @@ from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.export import ExportOptions
 from qsgm.train.export_report import ExportReport
 from qsgm.train.graphs.inspection import refuse_float_products
-<<<<<<< HEAD
 from qsgm.train.graphs.memory import step_memory
-from qsgm.train.grasp.calibration_set import CalibrationSet
-=======
 from qsgm.train.grasp import export as grasp_export
 from qsgm.train.grasp.calibration_set import CalibrationLessons, CalibrationSet
->>>>>>> 0551336 (Tests of pretraining, calibration, trunk and export on the new API; what they found is mended)
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
 from qsgm.train.grasp.export import fold_and_quantize
