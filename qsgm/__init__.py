@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from qsgm.grasp.heatmap import Detection, Place
     from qsgm.grasp.others import Other, other_in
     from qsgm.grasp.source import Demonstration
-    from qsgm.grasp.teach import FinetuneResult, finetune
+    from qsgm.grasp.taught import FinetuneResult
+    from qsgm.grasp.teach import finetune
     from qsgm.grasp.tuned import TunedObject, load_object
     from qsgm.grasp.verdict import Verdict
     from qsgm.images import read_frame
@@ -47,7 +48,7 @@ else:
         "Bundle": "qsgm.bundle",
         "Demonstration": "qsgm.grasp.source",
         "Detection": "qsgm.grasp.heatmap",
-        "FinetuneResult": "qsgm.grasp.teach",
+        "FinetuneResult": "qsgm.grasp.taught",
         "Head": "qsgm.task",
         "Labelled": "qsgm.task",
         "Layer": "qsgm.network",

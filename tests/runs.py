@@ -10,7 +10,8 @@ from qsgm.grasp.crops import CROPS
 from qsgm.grasp.others import Other
 from qsgm.grasp.source import CropSource, Demonstration, crop_source
 from qsgm.grasp.task import distractors_of
-from qsgm.grasp.teach import FinetuneResult, PreparedObject, prepare_object, tune_object
+from qsgm.grasp.taught import FinetuneResult, PreparedObject
+from qsgm.grasp.teach import prepare_object, tune_object
 from qsgm.tune.plan import resolve
 from qsgm.tune.settings import Settings
 

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from qsgm.bundle import Bundle
     from qsgm.grasp.others import Other
     from qsgm.grasp.source import Demonstration
-    from qsgm.grasp.teach import FinetuneResult
+    from qsgm.grasp.taught import FinetuneResult
     from qsgm.tune.settings import Settings
 
 app = typer.Typer()
@@ -195,7 +195,8 @@ def finetune(
 ) -> None:
     """Tune the network to the object in one frame or several, on the device."""
     from qsgm.files import check_replaceable
-    from qsgm.grasp.report import finetune_json, finetune_report
+    from qsgm.grasp.report import finetune_report
+    from qsgm.grasp.taught import finetune_json
     from qsgm.grasp.tuned import DESCRIPTION
 
     tuned, first = tuned_layers(layers, blocks), frames[0]

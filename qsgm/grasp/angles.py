@@ -5,6 +5,7 @@ The double angle (sin 2θ, cos 2θ) has no seam anywhere; the paper's (sin θ, c
 θ in (-π/2, π/2] breaks at ±90° and is kept for the paper's tables.
 """
 
+import math
 from typing import Literal, get_args
 
 import numpy as np
@@ -58,3 +59,19 @@ def mean_direction(angle_rad: Floats) -> tuple[float, float]:
     resultant = np.mean(np.exp(2j * np.asarray(angle_rad, dtype=np.float64)))
     mean = wrap_half_turn(np.asarray(np.angle(resultant) / 2))
     return float(mean), float(np.abs(resultant))
+
+
+def full_degrees(turn_rad: float) -> float:
+    """A turn in degrees in (-180, 180]."""
+    return float(180 - (180 - np.degrees(turn_rad)) % 360)
+
+
+def rounded_angle(angle_deg: float, digits: int) -> float | None:
+    """An angle in (-90, 90], rounded; None unless it is finite."""
+    return round_degrees(angle_deg, digits) if math.isfinite(angle_deg) else None
+
+
+def rounded_turn(turn_rad: float) -> float:
+    """A turn in degrees in (-180, 180], rounded to hundredths."""
+    rounded = round(full_degrees(turn_rad), 2) + 0.0
+    return 180.0 if rounded <= -180.0 else rounded

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.angles import wrap_half_turn
+from qsgm.grasp.angles import full_degrees, wrap_half_turn
 from qsgm.grasp.correlation import Fit
 from qsgm.grasp.decision import Decision
 from qsgm.grasp.judge import JUDGED, Appearance, best_fit, judge
@@ -119,11 +119,6 @@ class Finder:
 def confidence_of(lead: float) -> float:
     """Confidence that a fit's way round is right, by its lead over the opposite one."""
     return float(1 / (1 + np.exp(-_LEAD_SLOPE * lead)))
-
-
-def full_degrees(turn_rad: float) -> float:
-    """A turn in degrees in (-180, 180]."""
-    return float(180 - (180 - np.degrees(turn_rad)) % 360)
 
 
 def _distinct(sightings: Sequence[Sighting], frame_hw: tuple[int, int]) -> list[Sighting]:

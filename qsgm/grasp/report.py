@@ -6,62 +6,18 @@ The keys of the JSON objects are stable: more may be added, none goes or changes
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from qsgm.grasp.angles import round_degrees
-from qsgm.grasp.finding import full_degrees
+from qsgm.grasp.angles import round_degrees, rounded_angle, rounded_turn
 from qsgm.grasp.heatmap import Detection, Place
+from qsgm.grasp.taught import FinetuneResult
+from qsgm.grasp.verdict import Verdict
 from qsgm.tables import number, plain_table
-from qsgm.tune.report import course_json, fidelity_report, result_json, run_title, seconds_line
-
-if TYPE_CHECKING:
-    from qsgm.grasp.teach import FinetuneResult
-    from qsgm.grasp.verdict import Verdict
-
-
-def angle(value_deg: float, digits: int) -> float | None:
-    """A rounded angle in (-90, 90], None unless it is finite."""
-    return round_degrees(value_deg, digits) if math.isfinite(value_deg) else None
-
-
-def full_angle(turn_rad: float) -> float:
-    """A turn in degrees, rounded, in (-180, 180]."""
-    rounded = round(full_degrees(turn_rad), 2) + 0.0
-    return 180.0 if rounded <= -180.0 else rounded
-
-
-def finetune_json(result: "FinetuneResult", name: str, output: Path) -> dict[str, Any]:
-    """The stable keys of `qsgm finetune`, then the others."""
-    values, verdict = result_json(result, name, output), result.verdict
-    orientation = result.prepared.orientation
-    return values | {
-        "orientation_deg": angle(math.degrees(orientation.offset_rad), 2),
-        "orientation_strength": number(orientation.strength, 3),
-        **shown_json(result),
-        "verdict": verdict.to_json(),
-        "warnings": [*result.warnings, *verdict.reasons],
-    }
-
-
-def run_json(result: "FinetuneResult", name: str, output: Path) -> dict[str, Any]:
-    """What is kept with the tuned object: :func:`finetune_json` and how the run went."""
-    return finetune_json(result, name, output) | course_json(result)
-
-
-def shown_json(result: "FinetuneResult") -> dict[str, Any]:
-    """What was shown of the object."""
-    shown, others = result.prepared.shown, result.prepared.others_sha256
-    turns = [None if turn is None else full_angle(turn) for turn in shown.turns_rad]
-    return {
-        "scale": number(shown.scale, 5),
-        "span_px": None if shown.span_px is None else number(shown.span_px, 1),
-        "demonstrations": [{"turn_deg": turn} for turn in turns],
-        "others": len(others),
-    }
+from qsgm.tune.report import fidelity_report, run_title, seconds_line
 
 
 def predict_json(
@@ -92,7 +48,7 @@ def object_json(detection: Detection) -> dict[str, Any]:
         "quality": number(detection.quality, 4),
         "center_px": [number(value, 2) for value in detection.center_px],
         "displacement_px": [number(value, 2) for value in detection.displacement_px],
-        "angle_deg": angle(detection.angle_deg, 2),
+        "angle_deg": rounded_angle(detection.angle_deg, 2),
         "full_angle_deg": full_angle_json(detection.full_angle_deg),
         "full_angle_confidence": None if confidence is None else number(confidence, 4),
         "refined_by": detection.refined_by,
@@ -104,17 +60,17 @@ def place_json(place: Place) -> dict[str, Any]:
     return {
         "center_px": [number(value, 2) for value in place.center_px],
         "quality": number(place.quality, 4),
-        "angle_deg": angle(place.angle_deg, 2),
+        "angle_deg": rounded_angle(place.angle_deg, 2),
         "full_angle_deg": full_angle_json(place.full_angle_deg),
     }
 
 
 def full_angle_json(angle_deg: float | None) -> float | None:
     """A turn over the full circle, if it is known."""
-    return None if angle_deg is None else full_angle(math.radians(angle_deg))
+    return None if angle_deg is None else rounded_turn(math.radians(angle_deg))
 
 
-def finetune_report(result: "FinetuneResult", name: str) -> RenderableType:
+def finetune_report(result: FinetuneResult, name: str) -> RenderableType:
     """Before and after, fidelity, seconds, and whatever there is to say."""
     return Group(
         before_after_table(result, name),
@@ -124,7 +80,7 @@ def finetune_report(result: "FinetuneResult", name: str) -> RenderableType:
     )
 
 
-def verdict_lines(verdict: "Verdict") -> list[Text]:
+def verdict_lines(verdict: Verdict) -> list[Text]:
     """What to expect of the object, why, and what to do."""
     style = "bold green" if verdict.good else "bold yellow"
     return [
@@ -134,7 +90,7 @@ def verdict_lines(verdict: "Verdict") -> list[Text]:
     ]
 
 
-def before_after_table(result: "FinetuneResult", name: str) -> Table:
+def before_after_table(result: FinetuneResult, name: str) -> Table:
     """What tuning changed on the validation crops."""
     table = plain_table(run_title(result, name))
     table.add_column("200 validation crops")

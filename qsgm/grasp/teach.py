@@ -10,27 +10,19 @@ run of one method on it.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property
-from pathlib import Path
+from dataclasses import fields
 from typing import Any
 
-import cv2
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
-from qsgm import __version__
 from qsgm.bundle import Bundle
-from qsgm.grasp.lesson import GraspLabels, GraspLesson, Orientation
-from qsgm.grasp.likeness import likeness_of
+from qsgm.grasp.lesson import GraspLabels, GraspLesson
 from qsgm.grasp.others import Other, add_others
-from qsgm.grasp.report import run_json
-from qsgm.grasp.shown import Shown, shown
+from qsgm.grasp.shown import shown
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import distractors_of, task_of
-from qsgm.grasp.tuned import ObjectDescription, TunedObject, save_object
-from qsgm.grasp.verdict import Verdict, verdict_on
+from qsgm.grasp.taught import FinetuneResult, PreparedObject
 from qsgm.images import check_frame
 from qsgm.progress import Progress
 from qsgm.tune.plan import Plan, resolve
@@ -42,76 +34,6 @@ from qsgm.tune.settings import Settings
 Frame = NDArray[np.uint8]
 # One frame with the object at its centre, or some that show it anywhere.
 Frames = Frame | Sequence[Frame | Demonstration]
-
-
-@dataclass(frozen=True)
-class PreparedObject(Prepared):
-    """A taught object, before any step."""
-
-    labelled: GraspLabels
-    shown: Shown
-    others_sha256: tuple[str, ...]  # of the things that it is to be told apart from
-
-    @property
-    def orientation(self) -> Orientation:
-        """How the demonstrations lie as the untouched network sees them."""
-        return self.labelled.orientation
-
-
-@dataclass(frozen=True)
-class FinetuneResult(Result):
-    """A tuned object and everything that was measured on the way."""
-
-    prepared: PreparedObject
-
-    def save(self, folder: Path, name: str) -> None:
-        """Write the tuned object for `qsgm predict`; it appears complete or not at all.
-
-        Args:
-            folder: absent, empty or an earlier tuned object.
-            name: what the object is called.
-
-        Raises:
-            QsgmError: the folder cannot be written, or holds something else.
-        """
-        report = run_json(self, name, folder)
-        save_object(folder, self._description(name), self.network(), report)
-
-    def tuned_object(self, name: str = "object") -> TunedObject:
-        """The tuned object without a detour over the disk."""
-        return TunedObject(self._description(name), self.network(), self.plan.settings.threads)
-
-    @cached_property
-    def verdict(self) -> Verdict:
-        """Whether the object will be found and told apart."""
-        like = likeness_of(self.prepared.shown.patches[0])
-        strength = self.prepared.orientation.strength
-        return verdict_on(self.scores, self.untouched, strength, like, trained=self.plan.epochs > 0)
-
-    def _description(self, name: str) -> ObjectDescription:
-        prepared, task = self.prepared, task_of(self.prepared.bundle)
-        return ObjectDescription(
-            name,
-            task.encoding,
-            prepared.orientation.offset_rad,
-            prepared.shown.scale,
-            prepared.shown.views(prepared.orientation.of_each_rad),
-            task.decision,
-            self._made(),
-        )
-
-    def _made(self) -> dict[str, Any]:
-        """From what, by what: with the same of all this the same object comes out."""
-        return {
-            "qsgm": __version__,
-            "onnxruntime": ort.__version__,
-            "opencv": cv2.__version__,
-            "numpy": np.__version__,
-            "bundle_sha256": self.prepared.bundle.sha256(),
-            "seed": self.prepared.plan.settings.seed,
-            "frames_sha256": list(self.prepared.shown.sha256),
-            "others_sha256": list(self.prepared.others_sha256),
-        }
 
 
 def finetune(

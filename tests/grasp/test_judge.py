@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from toys import bump, lay, table, toy
 
+from qsgm.grasp.angles import full_degrees
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.evidence import NAMES
-from qsgm.grasp.finding import confidence_of, full_degrees
+from qsgm.grasp.finding import confidence_of
 from qsgm.grasp.judge import JUDGED, Appearance, cell_center, judge
 from qsgm.grasp.patch import Patch, cut_patch
 

@@ -13,10 +13,9 @@ from qsgm.bundle import Bundle
 from qsgm.grasp.angles import encode_angle
 from qsgm.grasp.crops import CROPS, TRAIN_CROPS
 from qsgm.grasp.lesson import GraspLabels, Orientation
-from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import distractors_of
-from qsgm.grasp.teach import FinetuneResult
+from qsgm.grasp.taught import FinetuneResult, finetune_json
 from qsgm.manifest import head_file
 from qsgm.weights import to_step_layout
 

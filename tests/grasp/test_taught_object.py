@@ -13,8 +13,7 @@ from runs import SHORT, Frame, planned
 from qsgm import finetune, load_object
 from qsgm.bundle import Bundle
 from qsgm.grasp.crops import TRAIN_CROPS
-from qsgm.grasp.report import finetune_json
-from qsgm.grasp.teach import FinetuneResult
+from qsgm.grasp.taught import FinetuneResult, finetune_json
 from qsgm.manifest import head_file
 from qsgm.tables import to_json
 from qsgm.weights import to_step_layout

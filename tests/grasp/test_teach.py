@@ -14,10 +14,9 @@ from qsgm import QsgmError, finetune, load_object
 from qsgm.bundle import Bundle
 from qsgm.grasp.crops import cut_crops, plan_crops
 from qsgm.grasp.others import other_in
-from qsgm.grasp.report import finetune_json
 from qsgm.grasp.source import Demonstration
 from qsgm.grasp.task import distractors_of
-from qsgm.grasp.teach import FinetuneResult
+from qsgm.grasp.taught import FinetuneResult, finetune_json
 from qsgm.grasp.tuned import MARGIN_PX
 
 

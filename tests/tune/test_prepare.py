@@ -10,7 +10,7 @@ from runs import SHORT, Frame, planned, prepared_by, tuned_by
 from qsgm import finetune
 from qsgm.bundle import Bundle
 from qsgm.grasp.crops import CROPS
-from qsgm.grasp.teach import FinetuneResult
+from qsgm.grasp.taught import FinetuneResult
 from qsgm.manifest import Precision
 from qsgm.schedule import BATCH
 from qsgm.tune.features import StreamedFeatures

@@ -15,7 +15,8 @@ from rich.console import Console
 from qsgm import QsgmError, defaults
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.fidelity import LayerFidelity
-from qsgm.grasp.teach import FinetuneResult, finetune, prepare_object, train_object, tune_object
+from qsgm.grasp.taught import FinetuneResult
+from qsgm.grasp.teach import finetune, prepare_object, train_object, tune_object
 from qsgm.manifest import MANIFEST, probe_file
 from qsgm.schedule import BATCH, steps_per_epoch
 from qsgm.tune import probe as probing

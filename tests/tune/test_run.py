@@ -15,7 +15,8 @@ from qsgm import QsgmError, finetune, load_bundle, load_object
 from qsgm.blocks import single_layers
 from qsgm.bundle import Bundle
 from qsgm.grasp.crops import CROPS
-from qsgm.grasp.teach import FinetuneResult, train_object, tune_object
+from qsgm.grasp.taught import FinetuneResult
+from qsgm.grasp.teach import train_object, tune_object
 from qsgm.manifest import PRECISIONS, Recipe, head_file
 from qsgm.sgm.int8 import SgmRanges, constants, quantize_sgm
 from qsgm.tune.features import SLICE
