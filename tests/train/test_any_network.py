@@ -287,3 +287,11 @@ def test_curvature_bends_the_same_in_the_graph_and_in_torch(
         weight, bias = curvature.precondition(plain[0].T[None], plain[1][None])
         close(bent[0].numpy(), weight[0].T.numpy())
         close(bent[1].numpy(), bias[0].numpy())
+
+
+@given(cases(("pixels",), padded_first=False))
+def test_layers_run_in_integers_up_to_the_first_without_a_relu(case: Case) -> None:
+    ranges = dict(observe_samples(case.net, case.samples(3)))
+    frozen = case.network.layers[:-1]
+    whole = next((k for k, layer in enumerate(frozen) if not layer.relu), len(frozen))
+    assert [*quantize_trunk(case.net, ranges)] == [*range(1, whole + 1)]
