@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from losses import HeadsLoss
 from networks import Case, blocks_of, cases, plain_layer, plain_maps
-from steps import CROPS, Exported, compare_steps
+from step_oracles import CROPS, Exported, compare_steps
 from test_trunk import integer_trunk
 from torch import Tensor
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from nets import random_net
-from steps import BATCH, HEADS, Exported, random_data, random_sgms
+from step_oracles import BATCH, HEADS, Exported, random_data, random_sgms
 
 from qsgm.blocks import parse_blocks
 from qsgm.grasp.network import GRASPNET

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from losses import GraspLoss
 from nets import random_net
-from steps import (
+from step_oracles import (
     BATCH,
     HEADS,
     Exported,

@@ -2,7 +2,7 @@
 
 import pytest
 from nets import random_net
-from steps import OPTIMIZERS, compare_runs
+from step_oracles import OPTIMIZERS, compare_runs
 
 from qsgm.blocks import parse_blocks
 from qsgm.train.graphs.optimizers import Optimizer

@@ -7,7 +7,7 @@ import pytest
 import torch
 from losses import GraspLoss
 from nets import random_net
-from steps import (
+from step_oracles import (
     BATCH,
     HEADS,
     Exported,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from losses import GraspLoss
 from nets import random_net
-from steps import (
+from step_oracles import (
     BATCH,
     CROPS,
     EPOCH,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from nets import random_net
-from steps import (
+from step_oracles import (
     HEADS,
     OPTIMIZERS,
     RATES,
