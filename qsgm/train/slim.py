@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import onnx
-
 from qsgm.blocks import Blocks, one_block
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
@@ -33,7 +31,7 @@ from qsgm.manifest import (
     step_file,
     trunk_file,
 )
-from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
+from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm, whole_model
 from qsgm.train.graphs.short_names import shorten
 
 
@@ -84,7 +82,9 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
             f"{' or '.join(bundle.manifest.blocks)}"
         )
     network = bundle.read(NETWORK)
-    graphs = {name: onnx.load(bundle.graph_path(name)) for name in kept_graphs(bundle, blocks)}
+    graphs = {
+        name: whole_model(bundle.read(name), bundle.read) for name in kept_graphs(bundle, blocks)
+    }
     shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
     sgms = {
         layer: shared_sgm(shared, bundle.float_sgm(layer), bundle.activation_bits(layer))

@@ -156,7 +156,7 @@ def bundle(folder: Path, material: Path, rng: Rng) -> None:
     for name in names:
         target = folder / name
         target.unlink(missing_ok=True)
-        target.hardlink_to(material / "bundle" / name)
+        target.symlink_to(material / "bundle" / name)
     if rng.random() < 0.6:
         manifest = altered(manifest, rng)
     else:

@@ -1,6 +1,7 @@
 """A slim bundle: less of the whole one, and every number the same."""
 
 import json
+import shutil
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -54,6 +55,18 @@ def test_tuning_with_it_gives_the_same_bits(
         whole.fidelity,
     )
     assert own.network() == whole.network()
+
+
+def test_it_comes_out_of_a_bundle_whose_files_have_other_names_too(
+    bundle: Bundle, slim: Bundle, tmp_path: Path
+) -> None:
+    linked = tmp_path / "linked"
+    shutil.copytree(bundle.folder, linked)
+    for path in list(linked.iterdir()):
+        (tmp_path / path.name).hardlink_to(path)  # as uv links packages out of its cache
+    slim_bundle(load_bundle(linked), parse_blocks("4,5,6"), tmp_path / "three")
+    for path in slim.folder.iterdir():
+        assert (tmp_path / "three" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_things_and_decision_stay(bundle: Bundle, slim: Bundle, tmp_path: Path) -> None:

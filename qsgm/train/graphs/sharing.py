@@ -3,14 +3,14 @@
 Any ONNX runtime finds them there when it opens a graph by its path.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from onnx import ModelProto
-from onnx.external_data_helper import set_external_data
+from onnx import ModelProto, load_model_from_string
+from onnx.external_data_helper import ExternalDataInfo, set_external_data, uses_external_data
 
 from qsgm.manifest import Place, SgmEntry
 from qsgm.sgm.float import FoldedSgm
@@ -89,6 +89,23 @@ class SharedConstants:
         if self._other is None or offset is None:
             return self.location, self.add(raw)
         return self._other.location, offset
+
+
+def whole_model(model: bytes, file: Callable[[str], bytes]) -> ModelProto:
+    """A model that holds the constants which it left in other files, whose bytes are asked for.
+
+    onnx.load reads them from the disk, and refuses files that have several names there, as an
+    installer that links its cache makes them.
+    """
+    whole = load_model_from_string(model)
+    for tensor in whole.graph.initializer:
+        if uses_external_data(tensor):
+            place = ExternalDataInfo(tensor)
+            rest = file(place.location)[place.offset or 0 :]
+            tensor.raw_data = rest[: place.length]
+            tensor.data_location = tensor.DEFAULT
+            tensor.ClearField("external_data")
+    return whole
 
 
 def shared_sgm(shared: SharedConstants, sgm: FoldedSgm, bits: ActivationBits) -> SgmEntry:
