@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from qsgm.blocks import single_layers
-from qsgm.bundle import load_bundle, probe_file
+from qsgm.bundle import load_bundle
 from qsgm.fidelity import cosine
+from qsgm.manifest import probe_file
 from qsgm.paths import bundle_folder
 from qsgm.runtime import session_options
-from qsgm.weights import to_step_layout
+from qsgm.tune.prepare import in_step_layout
 
 # isort: split
 import onnxruntime as ort  # behind qsgm, which keeps it from reporting home
@@ -39,9 +40,9 @@ def gradients(kind: str, options: ort.SessionOptions) -> dict[str, np.ndarray]:
         "labels": labels,
         "rows": np.arange(CROPS),
     }
-    for name, value in bundle.start_weights(TUNED).items():
-        feeds[name] = to_step_layout(value) if value.ndim > 1 else value
-    names = [f"int8{layer}" for layer in single_layers(TUNED).sgm_layers]
+    layers = bundle.network.last(TUNED)
+    feeds |= in_step_layout(bundle.start_weights(layers))
+    names = [f"int8{layer}" for layer in single_layers(layers).sgm_layers]
     return {
         f"{name} {kind}": value
         for name, value in zip(names, session.run(names, feeds), strict=True)

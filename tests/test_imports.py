@@ -5,6 +5,7 @@ it.
 """
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
@@ -102,3 +103,26 @@ def test_graphs_are_built_and_made_slim_without_torch() -> None:
         cwd=TOP.parent,
     )
     assert (done.stdout, done.stderr) == ("False\n", "")
+
+
+def test_everything_that_benchmarks_and_examples_ask_of_the_package_is_there() -> None:
+    """They run for minutes or need other packages, so that tests run few of them."""
+    root = TOP.parent
+    scripts = [
+        file for folder in ("benchmarks", "examples") for file in root.glob(f"{folder}/**/*.py")
+    ]
+    asked = {
+        (node.module, alias.name)
+        for script in scripts
+        for node in ast.walk(ast.parse(script.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith("qsgm.")
+        for alias in node.names
+    }
+    assert asked
+    missing = [
+        f"{module}.{name}"
+        for module, name in sorted(asked)
+        if f"{module}.{name}" not in FILES
+        and not (module in FILES and hasattr(importlib.import_module(f"{module}"), name))
+    ]
+    assert missing == []
