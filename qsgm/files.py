@@ -127,13 +127,29 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
     Raises:
         QsgmError: the place cannot be written to, or is something else than a file.
     """
+    with new_file(path) as new:
+        new.write_bytes(data)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Write a temporary file that becomes `path` when the block ends without an exception.
+
+    For what cannot be had as bytes; see :func:`write_bytes_atomic`.
+
+    Yields:
+        A name on the same disk, with the same ending, that nothing has yet.
+
+    Raises:
+        QsgmError: the place cannot be written to, or is something else than a file.
+    """
     final = _resolved(path)
     try:
         if final.exists() and not final.is_file():
             raise QsgmError(f"cannot write {path}: it exists and is not a file; pass another name")
         with _workshop(final.parent) as workshop:
-            new = workshop / _NEW
-            new.write_bytes(data)
+            new = (workshop / _NEW).with_suffix(final.suffix)
+            yield new
             _sync(new)
             new.replace(final)
             _sync(final.parent)
@@ -142,13 +158,14 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
 
 
 @contextmanager
-def new_folder(path: Path, marker: str) -> Iterator[Path]:
+def new_folder(path: Path, marker: str, *, replace: bool = True) -> Iterator[Path]:
     """Fill a temporary folder that becomes `path` when the block ends without an exception.
 
     Args:
         path: the folder to make. It may be absent, empty, or an earlier output of this kind.
         marker: name of a file that every folder of this kind holds and no other kind does, such as
             ``object.json``. The block has to write it.
+        replace: whether an earlier output may be replaced.
 
     Yields:
         An empty folder on the same disk.
@@ -167,8 +184,27 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
                 raise ValueError(f"{path} cannot be made: {marker} was not written")
             check_replaceable(path, marker)
             _write_listing(new)
-            _take_place(new, final)
+            if replace:
+                _take_place(new, final)
+            else:
+                new.rename(final)  # which fails where there is anything by now
             _sync(final.parent)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+def remove_folder(path: Path, marker: str) -> None:
+    """Remove a folder that qsgm wrote: whole or not at all. Of a link, the link alone.
+
+    Raises:
+        QsgmError: it holds something else, or cannot be removed.
+    """
+    check_replaceable(path, marker)
+    place = _resolved(path.parent) / path.name
+    try:
+        with _workshop(place.parent) as workshop:
+            place.rename(workshop / _NEW)  # a workshop is cleared, or swept by whoever comes next
+            _sync(place.parent)
     except OSError as error:
         raise _cannot_write(path, error) from error
 

@@ -33,18 +33,31 @@ def calibration_folder(flag: Path | None = None) -> Path:
     return _artifact("calib", "--calib", flag)
 
 
-def object_folder(frame: Path) -> Path:
-    """Where the object tuned on `frame` goes when ``-o`` is not given: named after the frame.
+def objects_folder() -> Path:
+    """Where this user's objects are, unless ``-o`` said otherwise. It may not exist yet.
 
-    Letters and digits of any script stay. Where the frame's name has anything else in it, a short
-    hash tells it from others that would come to the same.
+    Raises:
+        QsgmError: this user has no home folder.
     """
-    name = name_of(frame)
+    return _data_folder() / "objects"
+
+
+def object_folder(frame: Path) -> Path:
+    """Where the object tuned on `frame` goes when ``-o`` is not given: named after the frame."""
+    return folder_named(name_of(frame))
+
+
+def folder_named(name: str) -> Path:
+    """Where this user's object of that name is.
+
+    Letters and digits of any script stay. Where the name has anything else in it, a short hash
+    tells it from others that would come to the same.
+    """
     kept = re.sub(r"[^\w.-]+", "_", name)[:_LONGEST_NAME].strip("._")
     if kept != name:
         digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
         kept = f"{kept}-{digest}" if kept else f"object-{digest}"
-    return _data_folder() / "objects" / kept
+    return objects_folder() / kept
 
 
 def name_of(frame: Path) -> str:
@@ -61,19 +74,31 @@ def remember_object(folder: Path) -> None:
     write_bytes_atomic(_last_object_file(), os.fsencode(folder.resolve()) + b"\n")
 
 
+def is_last_object(folder: Path) -> bool:
+    """Whether ``qsgm predict`` uses this object when ``--object`` is not given.
+
+    Raises:
+        QsgmError: nobody may look.
+    """
+    return _last_object() == str(folder.resolve())
+
+
+def forget_last_object() -> None:
+    """Let ``qsgm predict`` ask for ``--object`` until another one is tuned.
+
+    Raises:
+        QsgmError: the user's data folder cannot be written.
+    """
+    write_bytes_atomic(_last_object_file(), b"")
+
+
 def last_object_folder() -> Path:
     """The object tuned last by this user, wherever it was written.
 
     Raises:
         QsgmError: nothing was tuned here yet, or it is gone, or nobody may look.
     """
-    file = _last_object_file()
-    try:
-        there = file.exists()
-    except OSError:  # not allowed to look: reading says so
-        there = True
-    content = read_file(file, _LONGEST_PATH, "the name of the last object") if there else b""
-    text = os.fsdecode(content.removesuffix(b"\n"))
+    text = _last_object()
     if not text:
         raise QsgmError(
             "no object was tuned here yet: run `qsgm finetune object.png` first or pass --object"
@@ -84,6 +109,17 @@ def last_object_folder() -> Path:
             f"the object tuned last, {folder}, is gone: run `qsgm finetune` again or pass --object"
         )
     return folder
+
+
+def _last_object() -> str:
+    """The last object's folder as it was remembered; empty where there is none."""
+    file = _last_object_file()
+    try:
+        there = file.exists()
+    except OSError:  # not allowed to look: reading says so
+        there = True
+    content = read_file(file, _LONGEST_PATH, "the name of the last object") if there else b""
+    return os.fsdecode(content.removesuffix(b"\n"))
 
 
 def _artifact(name: str, option: str, flag: Path | None) -> Path:

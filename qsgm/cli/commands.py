@@ -33,6 +33,7 @@ from qsgm.cli.options import (
     JsonOption,
     MethodName,
     MethodOption,
+    ObjectsOption,
     OptimizerOption,
     OthersOption,
     PrecisionOption,
@@ -220,10 +221,7 @@ def finetune(
 @app.command()
 def predict(
     scene: SceneArgument,
-    tuned: Annotated[
-        Path | None,
-        typer.Option("--object", metavar="DIR", help="Tuned object; default: the last one."),
-    ] = None,
+    tuned: ObjectsOption = None,
     everything: Annotated[
         bool, typer.Option("--all", help="List every instance of the object.")
     ] = False,
@@ -239,10 +237,13 @@ def predict(
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the tuned object: where it is, how far to move, how far to turn."""
-    from qsgm.grasp.pictures import draw_detection
-    from qsgm.grasp.report import detection_table, instances_table, predict_json
-    from qsgm.grasp.tuned import load_object
+    """Find the tuned object, or several: where it is, how far to move, how far to turn.
+
+    With several, --json describes the surest one and lists all of them as `objects`, each entry
+    with its name and whether it was `found`. With one, `objects` is what --all found of it.
+    """
+    from qsgm.grasp.sights import look_for, sights_json, sights_picture, sights_table
+    from qsgm.grasp.store import load_objects
     from qsgm.images import check_png_name, read_frame, write_png
 
     if everything and any_distance:
@@ -250,20 +251,14 @@ def predict(
     if output is not None:
         check_png_name(output)
         check_output(output, scene)
-    found = load_object(paths.last_object_folder() if tuned is None else tuned, threads)
+    objects = load_objects(tuned or (), threads)
     frame = read_frame(scene)
-    look = found.locate_at_any_distance if any_distance else found.locate
-    detection, heatmap = look(frame)
-    instances = found.locate_all(frame) if everything else None
-    name = found.description.name
+    sights = [
+        look_for(one, frame, everything=everything, any_distance=any_distance) for one in objects
+    ]
     if output is not None:
-        picture = draw_detection(frame, heatmap, detection, name, instances or ())
-        write_png(output, picture)
-    report = predict_json(detection, heatmap.shape, name, output, instances)
-    table = (
-        detection_table(detection, name) if instances is None else instances_table(instances, name)
-    )
-    show(report, table, as_json)
+        write_png(output, sights_picture(frame, sights))
+    show(sights_json(sights, output), sights_table(sights), as_json)
     if output is not None and not as_json:
         tell("picture", output)
 

@@ -108,6 +108,14 @@ CentersOption = Annotated[
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE.PNG", help="The frame to look at; - is what is piped in.")
 ]
+ObjectsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--object",
+        metavar="DIR|NAME",
+        help="Tuned object, a folder or one of yours by name; repeatable; default: the last one.",
+    ),
+]
 BundleOption = Annotated[
     Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
 ]

@@ -6,7 +6,7 @@ size; lengths that belong to the drawing are in units of 1/1280 of the canvas wi
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -100,6 +100,46 @@ def draw_detection(
         _draw_guess(canvas, detection.center_px)
     found = max(len(instances), int(detection.found))
     return np.concatenate([canvas.image, _caption(canvas, detection, title, found)])
+
+
+def draw_objects(
+    frame: Picture, places: Sequence[tuple[str, Detection]], *, enlarged: bool = True
+) -> Picture:
+    """Draw where several objects are, each with its name; those not found are listed below.
+
+    Args:
+        frame: (H, W, 3) BGR.
+        places: by name of the object.
+        enlarged: to at least 1280 px; else the picture is as large as the frame.
+    """
+    if enlarged:
+        canvas = _enlarge(frame, 1.0, dim=False)
+    else:
+        canvas = _Canvas(frame.copy(), 1, max(frame.shape[1] / CANVAS_WIDTH_PX, 0.6), 1.0)
+    for name, place in places:
+        if place.found:
+            seen = replace(canvas, reach=1 / place.scale)
+            _draw_window(seen, place.center_px)
+            _draw_gripper(seen, place)
+            x, y = seen.at(place.center_px)
+            corner = HALF_CROP_PX * seen.scale * seen.reach
+            _label(canvas, f"{name} {place.quality:.2f}", (x - corner, y - corner), _GOOD)
+    absent = [name for name, place in places if not place.found]
+    if absent:
+        below = (12 * canvas.unit, canvas.image.shape[0] - 16 * canvas.unit)
+        _label(canvas, "not found: " + ", ".join(absent), below, _BAD)
+    return canvas.image
+
+
+def _label(canvas: _Canvas, text: str, at: Point, color: Color) -> None:
+    """Text with a dark rim, inside of the canvas."""
+    size, (height, width) = canvas.unit * 0.8, canvas.image.shape[:2]
+    shown = _shortened(as_text(text), width - 16 * canvas.unit, size)
+    x = min(max(at[0], 8 * canvas.unit), width - 8 * canvas.unit - _text_width(shown, size))
+    where = (round(x), round(min(max(at[1], 32 * canvas.unit), height - 8)))
+    for paint, more in ((_OUTLINE, canvas.thick(3)), (color, 0)):
+        weight = _weight(size, bold=True) + more
+        cv2.putText(canvas.image, shown, where, _FONT, size, paint, weight, cv2.LINE_AA)
 
 
 def _enlarge(frame: Picture, reach: float, *, dim: bool) -> _Canvas:

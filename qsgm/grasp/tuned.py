@@ -301,10 +301,19 @@ def load_object(folder: Path, threads: int = 1) -> TunedObject:
     Raises:
         QsgmError: it is missing, altered, or something else.
     """
-    return read_whole(folder, lambda: _load_object(folder, threads))
+    return TunedObject(*read_object(folder), threads)
 
 
-def _load_object(folder: Path, threads: int) -> TunedObject:
+def read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
+    """What an object's folder says, and its network as an ONNX file; nothing is run.
+
+    Raises:
+        QsgmError: it is missing, altered, or something else.
+    """
+    return read_whole(folder, lambda: _read_object(folder))
+
+
+def _read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
     path = folder / DESCRIPTION
     data = read_file(path, MANIFEST_BYTES, f"an object written by `{_COMMAND}`")
     manifest = parse_description(data, path, FORMAT, VERSIONS, _COMMAND)
@@ -320,7 +329,7 @@ def _load_object(folder: Path, threads: int) -> TunedObject:
     description = ObjectDescription(as_text(name), encoding, offset_rad)
     if not first:
         description = _with_looks(description, folder, manifest)
-    return TunedObject(description, network, threads)
+    return description, network
 
 
 def _unaltered(folder: Path, name: object, sha256: object) -> bytes:
