@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from qsgm.grasp.teach import finetune
     from qsgm.grasp.tuned import TunedObject, load_object
     from qsgm.grasp.verdict import Verdict
+    from qsgm.grasp.watch import Watched, watch
     from qsgm.images import read_frame
     from qsgm.network import Layer, Network, conv
     from qsgm.task import Head, Labelled, Lesson, Task
@@ -65,6 +66,7 @@ else:
         "Task": "qsgm.task",
         "TunedObject": "qsgm.grasp.tuned",
         "Verdict": "qsgm.grasp.verdict",
+        "Watched": "qsgm.grasp.watch",
         "conv": "qsgm.network",
         "finetune": "qsgm.grasp.teach",
         "load_bundle": "qsgm.bundle",
@@ -73,6 +75,7 @@ else:
         "prepare": "qsgm.tune.prepare",
         "read_frame": "qsgm.images",
         "resolve": "qsgm.tune.plan",
+        "watch": "qsgm.grasp.watch",
     }
 
     def __getattr__(name: str) -> object:
@@ -104,6 +107,7 @@ __all__ = [
     "Task",
     "TunedObject",
     "Verdict",
+    "Watched",
     "__version__",
     "conv",
     "finetune",
@@ -113,4 +117,5 @@ __all__ = [
     "prepare",
     "read_frame",
     "resolve",
+    "watch",
 ]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from qsgm import __version__
-from qsgm.cli import bench, commands
+from qsgm.cli import bench, commands, objects, watching
 from qsgm.cli.streams import complain
 
 EXIT_ABORTED = 130
@@ -20,6 +20,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(commands.app)
+app.add_typer(watching.app)
+app.add_typer(objects.app, name="objects")
 app.add_typer(bench.app, name="bench")
 
 

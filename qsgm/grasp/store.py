@@ -12,8 +12,15 @@ from typing import Any
 
 from qsgm import paths
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import new_folder, remove_folder
-from qsgm.grasp.tuned import DESCRIPTION, ObjectDescription, TunedObject, load_object, read_object
+from qsgm.files import is_plain, new_folder, remove_folder
+from qsgm.grasp.tuned import (
+    DESCRIPTION,
+    MARGIN_PX,
+    ObjectDescription,
+    TunedObject,
+    load_object,
+    read_object,
+)
 from qsgm.manifest import NETWORK
 from qsgm.tables import number
 
@@ -63,8 +70,7 @@ class StoredObject:
         if about is None:
             raise QsgmError(str(self.problem))
         return self.to_json() | {
-            "encoding": about.encoding,
-            "offset_deg": number(math.degrees(about.offset_rad), 2),
+            **_reading(about),
             "views": len(about.views),
             "decision": about.decision is not None,
             "made": dict(about.made),
@@ -140,13 +146,36 @@ def load_objects(given: Sequence[Path], threads: int = 1) -> list[TunedObject]:
     return objects
 
 
+def check_object(folder: Path) -> None:
+    """Refuse a folder that no tuned object is in.
+
+    Raises:
+        QsgmError: says what was expected.
+    """
+    if not _holds_object(folder):
+        raise QsgmError(
+            f"{folder} is no object: expected a folder with {DESCRIPTION}; see `qsgm objects list`"
+        )
+
+
+def graph_of(folder: Path) -> tuple[bytes, dict[str, Any]]:
+    """An object's network as an ONNX file, and what reading its answers takes.
+
+    Raises:
+        QsgmError: the object cannot be used.
+    """
+    about, network = read_object(folder)
+    margin_px = MARGIN_PX if about.views else 0
+    return network, {"object": about.name, **_reading(about), "margin_px": margin_px}
+
+
 def remove_object(folder: Path) -> None:
     """Remove an object, whole or not at all.
 
     Raises:
         QsgmError: it is none, it has something else in it, or it cannot be removed.
     """
-    _check_object(folder)
+    check_object(folder)
     last = paths.is_last_object(folder)
     remove_folder(folder, DESCRIPTION)
     if last:
@@ -162,10 +191,11 @@ def rename_object(folder: Path, name: str) -> Path:
     Raises:
         QsgmError: it is no object, there is one of that name, or the place cannot be written to.
     """
-    _check_object(folder)
-    if not name.strip() or len(name) > LONGEST_NAME:
+    check_object(folder)
+    if not (is_plain(name) and name.strip() and len(name) <= LONGEST_NAME):
         raise QsgmError(
-            f"{name!r} cannot be a name: expected 1 to {LONGEST_NAME} letters; pass another one"
+            f"{name!r} cannot be a name: expected 1 to {LONGEST_NAME} letters of any script, no "
+            "slash; pass another one"
         )
     new = folder.with_name(paths.folder_named(name).name)
     if new.exists() or new.is_symlink():
@@ -173,20 +203,13 @@ def rename_object(folder: Path, name: str) -> Path:
     last = paths.is_last_object(folder)
     with new_folder(new, DESCRIPTION, replace=False) as copy:
         shutil.copytree(folder, copy, dirs_exist_ok=True)
-        values = json.loads((copy / DESCRIPTION).read_bytes()) | {"name": as_text(name)}
+        values = json.loads((copy / DESCRIPTION).read_bytes()) | {"name": name}
         (copy / DESCRIPTION).write_text(json.dumps(values, indent=1) + "\n")
         read_object(copy)  # damaged before, or replaced while it was copied
     if last:
         paths.remember_object(new)
     remove_folder(folder, DESCRIPTION)
     return new
-
-
-def _check_object(folder: Path) -> None:
-    if not _holds_object(folder):
-        raise QsgmError(
-            f"{folder} is no object: expected a folder with {DESCRIPTION}; see `qsgm objects list`"
-        )
 
 
 def _holds_object(folder: Path) -> bool:
@@ -201,6 +224,14 @@ def _bytes_in(folder: Path) -> int:
     with suppress(OSError):
         return sum(one.stat().st_size for one in folder.iterdir() if one.is_file())
     return 0
+
+
+def _reading(about: ObjectDescription) -> dict[str, Any]:
+    return {
+        "scale": number(about.scale, 5),
+        "encoding": about.encoding,
+        "offset_deg": number(math.degrees(about.offset_rad), 2),
+    }
 
 
 def _text(value: object) -> str | None:
