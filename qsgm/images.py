@@ -48,10 +48,11 @@ _JPEG_SCAN = 0xDA
 _JPEG_END = 0xD9
 # What a sensor gives, where a file has 16 bits.
 _SENSOR_BITS = (10, 12, 14, 16)
-# Lines of libpng, libjpeg and OpenCV's decoders on stderr.
+# Lines of libpng, libjpeg, FFmpeg and OpenCV's decoders on stderr.
 _COMPLAINT = re.compile(
     rb"libpng |Corrupt JPEG|Premature end of JPEG|Inconsistent progression|Invalid SOS|"
-    rb"Unsupported|Unknown Adobe|Warning: unknown JFIF|\[ *(?:WARN|ERROR):.*(?:grfmt|loadsave)"
+    rb"Unsupported|Unknown Adobe|Warning: unknown JFIF|\[[\w,]+ @ 0x|Truncating packet|"
+    rb"Unexpected element|\[ *(?:WARN|ERROR):.*(?:grfmt|loadsave|cap[._])"
 )
 # Those after which the picture is not what was taken. Some cameras pad; that does no harm.
 _DAMAGE = re.compile(

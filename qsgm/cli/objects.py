@@ -1,5 +1,7 @@
 """`qsgm objects`: this user's taught objects, listed, shown, removed, renamed, copied out."""
 
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,11 +117,10 @@ def _done(values: dict[str, Any], what: str, path: Path, as_json: bool) -> None:
 
 
 def _agreed(question: str) -> bool:
-    try:
-        return typer.confirm(question, err=True)
-    except typer.Abort:  # nobody is there, or it was interrupted
-        complain("")
-        return False
+    complain(f"{question} [y/N]")  # not by typer, which writes to stdout as well
+    with suppress(OSError, ValueError):  # nobody can be heard
+        return sys.stdin is not None and sys.stdin.readline().strip().lower() in ("y", "yes")
+    return False
 
 
 def _listing(found: "list[StoredObject]") -> "RenderableType":
