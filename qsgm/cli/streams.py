@@ -2,6 +2,7 @@
 
 import io
 import os
+import select
 import sys
 from contextlib import suppress
 from typing import Any
@@ -21,8 +22,13 @@ class _Stdout(io.FileIO):
     def write(self, data: Any, /) -> int:
         if self._broken:
             return len(data)
+        left = memoryview(data)
         try:
-            return super().write(data) or 0
+            while left:
+                left = left[super().write(left) or 0 :]
+                if left:  # part of it, or nothing yet where it does not block
+                    select.select((), (self,), ())
+            return len(data)
         except OSError as error:
             self._broken = True
             if isinstance(error, BrokenPipeError):
@@ -42,11 +48,13 @@ def use_streams() -> None:
         pass
     os.close(descriptor)
     if sys.stdout is not None:
+        # Nothing in between: a buffer whose writing is interrupted does not know how much of it
+        # went out, and says it again when the process ends.
         sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Stdout()),
+            _Stdout(),
             encoding=sys.stdout.encoding,
             errors="backslashreplace",
-            line_buffering=sys.stdout.isatty(),
+            write_through=True,
         )
 
 
