@@ -75,12 +75,10 @@ def remember_object(folder: Path) -> None:
 
 
 def is_last_object(folder: Path) -> bool:
-    """Whether ``qsgm predict`` uses this object when ``--object`` is not given.
-
-    Raises:
-        QsgmError: nobody may look.
-    """
-    return _last_object() == str(folder.resolve())
+    """Whether ``qsgm predict`` uses this object when ``--object`` is not given, as far as known."""
+    with suppress(QsgmError):  # this user has no data folder, or nobody may look
+        return _last_object() == str(folder.resolve())
+    return False
 
 
 def forget_last_object() -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from qsgm.grasp.store import StoredObject
 
-app = typer.Typer(help="This user's taught objects.", no_args_is_help=True)
+app = typer.Typer(help="This user's taught objects.")
 NameArgument = Annotated[
     Path, typer.Argument(metavar="NAME", help="An object's name, or its folder.")
 ]

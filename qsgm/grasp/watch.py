@@ -12,7 +12,7 @@ import glob
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -129,8 +129,8 @@ def open_stream(source: str | int | Path, every: int = 1) -> Stream:
                 return _captured(str(path.resolve()), _FILE_READERS, str(path), every)
             return _pictures([path] if _PICTURE.match(start) else [], source, every)
         return _pictures([Path(one) for one in glob.glob(text)], source, every)  # noqa: PTH207
-    except (OSError, ValueError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).lower()
+    except (OSError, ValueError, OverflowError, cv2.error) as error:
+        reason = " ".join((getattr(error, "strerror", None) or str(error)).lower().split())
         raise QsgmError(f"cannot read {source}: {reason}; expected {_EXPECTED}") from error
 
 
@@ -222,7 +222,8 @@ def _frames(
     number, start = 0, time.monotonic()
     try:
         while True:
-            with decoding():
+            there, frame = False, None
+            with decoding(), suppress(cv2.error, MemoryError):
                 there, frame = capture.read() if number % every == 0 else (capture.grab(), None)
             if not there:
                 break

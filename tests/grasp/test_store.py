@@ -148,6 +148,18 @@ def test_a_removed_object_is_gone_and_no_longer_the_last(qsgm: Run, mug: Path) -
         paths.last_object_folder()
 
 
+def test_an_object_in_a_folder_needs_no_home(
+    qsgm: Run, mug: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(mug, tmp_path / "mug")
+    for name in ("XDG_DATA_HOME", "HOME"):
+        monkeypatch.setenv(name, "")
+    assert not qsgm("objects", "show", folder, "--json").json["last"]
+    assert qsgm("objects", "remove", "--yes", folder).code == 0
+    assert not folder.exists()
+    assert_refused(qsgm("objects", "list"), 1, "no home folder")
+
+
 def test_removing_another_object_leaves_the_last_one_remembered(mug: Path) -> None:
     remove_object(teach(paths.folder_named("cup"), "cup", hook()))
     assert paths.last_object_folder() == mug

@@ -97,6 +97,7 @@ def test_pictures_come_in_the_order_of_the_numbers_in_their_names(tmp_path: Path
         ("missing.avi", None),
         ("http://localhost:1/a.avi", None),
         ("98", None),
+        ("9" * 30, None),
     ],
 )
 def test_what_is_no_stream_is_refused_in_one_line(
