@@ -16,6 +16,7 @@ from qsgm.files import is_plain, new_folder, remove_folder
 from qsgm.grasp.tuned import (
     DESCRIPTION,
     MARGIN_PX,
+    MOST_VIEWS,
     ObjectDescription,
     TunedObject,
     load_object,
@@ -26,6 +27,7 @@ from qsgm.tables import number
 
 LONGEST_NAME = 200
 _LIBRARIES = ("qsgm", "onnxruntime", "opencv", "numpy")
+_MADE = (*_LIBRARIES, "bundle_sha256", "seed", "frames_sha256", "others_sha256")
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class StoredObject:
             **_reading(about),
             "views": len(about.views),
             "decision": about.decision is not None,
-            "made": dict(about.made),
+            "made": {key: _plain(about.made.get(key)) for key in _MADE},
         }
 
 
@@ -232,6 +234,13 @@ def _reading(about: ObjectDescription) -> dict[str, Any]:
         "encoding": about.encoding,
         "offset_deg": number(math.degrees(about.offset_rad), 2),
     }
+
+
+def _plain(value: object) -> object:
+    """What may be shown of a value that anybody may have written."""
+    if isinstance(value, list):
+        return [_text(one) for one in value[:MOST_VIEWS]]
+    return value if isinstance(value, int) else _text(value)
 
 
 def _text(value: object) -> str | None:

@@ -72,12 +72,17 @@ def test_a_damaged_object_is_listed_with_what_is_wrong_and_can_be_removed(
     assert names() == []
 
 
-@pytest.mark.parametrize("made", [{"frames_sha256": 3, "qsgm": [1]}, {}])
-def test_provenance_that_says_nonsense_is_not_shown(mug: Path, made: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "made", [{"frames_sha256": 3, "qsgm": [1], "seed": float("nan"), "x": float("inf")}, {}]
+)
+def test_provenance_that_says_nonsense_is_not_shown(
+    qsgm: Run, mug: Path, made: dict[str, object]
+) -> None:
     path = mug / "object.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"made": made}))
     values = stored_objects()[0].to_json()
     assert (values["frames"], values["versions"]["qsgm"]) == (None, None)
+    assert qsgm("objects", "show", "mug", "--json").json["made"]["seed"] is None
 
 
 def test_show_says_what_reading_the_graph_takes(qsgm: Run, mug: Path) -> None:
