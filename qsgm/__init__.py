@@ -37,6 +37,11 @@ if TYPE_CHECKING:
     from qsgm.grasp.watch import Watched, watch
     from qsgm.images import read_frame
     from qsgm.network import Layer, Network, conv
+    from qsgm.samples.lesson import Samples
+    from qsgm.samples.task import SampleTask
+    from qsgm.samples.taskfile import load_task
+    from qsgm.samples.teach import learn
+    from qsgm.samples.tuned import TunedNetwork, load_network
     from qsgm.task import Head, Labelled, Lesson, Task
     from qsgm.tune.plan import Plan, resolve
     from qsgm.tune.prepare import Prepared, prepare
@@ -62,15 +67,21 @@ else:
         "Prepared": "qsgm.tune.prepare",
         "Probe": "qsgm.tune.probe",
         "Result": "qsgm.tune.result",
+        "SampleTask": "qsgm.samples.task",
+        "Samples": "qsgm.samples.lesson",
         "Settings": "qsgm.tune.settings",
         "Task": "qsgm.task",
+        "TunedNetwork": "qsgm.samples.tuned",
         "TunedObject": "qsgm.grasp.tuned",
         "Verdict": "qsgm.grasp.verdict",
         "Watched": "qsgm.grasp.watch",
         "conv": "qsgm.network",
         "finetune": "qsgm.grasp.teach",
+        "learn": "qsgm.samples.teach",
         "load_bundle": "qsgm.bundle",
+        "load_network": "qsgm.samples.tuned",
         "load_object": "qsgm.grasp.tuned",
+        "load_task": "qsgm.samples.taskfile",
         "other_in": "qsgm.grasp.others",
         "prepare": "qsgm.tune.prepare",
         "read_frame": "qsgm.images",
@@ -103,16 +114,22 @@ __all__ = [
     "Probe",
     "QsgmError",
     "Result",
+    "SampleTask",
+    "Samples",
     "Settings",
     "Task",
+    "TunedNetwork",
     "TunedObject",
     "Verdict",
     "Watched",
     "__version__",
     "conv",
     "finetune",
+    "learn",
     "load_bundle",
+    "load_network",
     "load_object",
+    "load_task",
     "other_in",
     "prepare",
     "read_frame",

@@ -52,6 +52,16 @@ from qsgm.cli.options import (
     settings_of,
     tuned_layers,
 )
+from qsgm.cli.samples import (
+    TaskOption,
+    export_task,
+    is_of_samples,
+    learn_task,
+    predict_task,
+    pretrain_task,
+    refuse_options,
+    show_learnt,
+)
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError, as_text
 
@@ -77,17 +87,22 @@ def pretrain(
         str | None,
         typer.Option(metavar="N,N", help="Channels of the SGMs' hidden layers, such as 64,64."),
     ] = None,
+    task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Pretrain network and SGMs on drawn objects (host; needs torch).
+    """Pretrain network and SGMs on drawn objects, or on a task's samples (host; needs torch).
 
     What was interrupted goes on where it stopped when the same command runs again.
     """
     chosen = {} if hidden is None else {"hidden": parsed_channels(hidden)}
+    if task is not None:
+        refuse_options(encoding=encoding is not Encoding.DOUBLE)
+        pretrain_task(task, output, seed, device.value, chosen, as_json)
+        return
     host = host_module("qsgm.train.grasp.pretrain")
-    config, task = host.PretrainConfig(**chosen), host.DrawnGrasping(encoding=encoding.value)
+    config, drawn = host.PretrainConfig(**chosen), host.DrawnGrasping(encoding=encoding.value)
     with progress() as watch:
-        host.pretrain_grasping(task, output, seed, device.value, watch, config)
+        host.pretrain_grasping(drawn, output, seed, device.value, watch, config)
     if as_json:
         print_json({"output": str(output), "seed": seed, "device": device.value})
     else:
@@ -133,15 +148,19 @@ def fold_and_quantize(
     activation_bits: Annotated[
         ActivationBitsChoice, typer.Option(help="Of the int8 SGMs: one u8 plane, or two.")
     ] = ActivationBitsChoice.SIXTEEN,
+    task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fold batchnorm, calibrate, quantize to int8, export ONNX graphs (host; needs torch)."""
     more = [parsed_blocks(text) for text in blocks or ()]
+    bits = int(activation_bits.value)
+    chosen = {"blocks": tuple(more), "calibrator": calibrator.value, "activation_bits": bits}
+    if task is not None:
+        refuse_options(calib=calib is not None)
+        export_task(task, checkpoint, output, chosen, as_json)
+        return
     host = host_module("qsgm.train.grasp.export")
-    calibration, bits = paths.calibration_folder(calib), int(activation_bits.value)
-    options = host.ExportOptions(
-        blocks=tuple(more), calibrator=calibrator.value, activation_bits=bits
-    )
+    calibration, options = paths.calibration_folder(calib), host.ExportOptions(**chosen)
     with progress() as watch:
         report = host.fold_and_quantize(checkpoint, calibration, output, watch, options)
     show(report.to_json(), report, as_json)
@@ -192,6 +211,7 @@ def finetune(
         typer.Option("-o", "--output", metavar="DIR", help="Default: among this user's objects."),
     ] = None,
     threads: ThreadsOption = 1,
+    task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Tune the network to the object in one frame or several, on the device."""
@@ -208,8 +228,18 @@ def finetune(
     settings = replace(settings, recalibrate=recalibrate, stream=stream)
     folder = paths.object_folder(first) if output is None else output
     check_replaceable(folder, DESCRIPTION)
-    result = _finetune(frames, centers, others or (), open_bundle(bundle), settings, span)
-    name = as_text(paths.name_of(first))
+    opened, name = open_bundle(bundle), as_text(paths.name_of(first))
+    if is_of_samples(opened, task):
+        refuse_options(center=bool(center), span=span is not None, **{"not": bool(others)})
+        usual = layers is None and blocks is None
+        learnt = learn_task(task, frames, opened, settings, usual_layers=usual)
+        learnt.save(folder, name)
+        _remember(folder, chosen=output is not None)
+        show_learnt(learnt, folder, name, as_json)
+        if not as_json:
+            tell("tuned network", folder)
+        return
+    result = _finetune(frames, centers, others or (), opened, settings, span)
     report = finetune_json(result, name, folder)
     result.save(folder, name)
     _remember(folder, chosen=output is not None)
@@ -235,6 +265,7 @@ def predict(
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,
     threads: ThreadsOption = 1,
+    task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the tuned object, or several: where it is, how far to move, how far to turn.
@@ -248,6 +279,9 @@ def predict(
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
+    folder = paths.last_object_folder() if tuned is None else tuned
+    if predict_task(folder, task, scene, threads, as_json):
+        return
     if output is not None:
         check_png_name(output)
         check_output(output, scene)

@@ -7,8 +7,11 @@ if TYPE_CHECKING:
     from qsgm.train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
     from qsgm.train.export import ExportOptions, export_bundle
     from qsgm.train.export_report import ExportReport
+    from qsgm.train.model.from_torch import from_torch
     from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
     from qsgm.train.quantization.lessons import Lessons
+    from qsgm.train.samples.build import build
+    from qsgm.train.samples.drawn import quicker, usual_config
     from qsgm.train.slim import SlimReport, slim_bundle
     from qsgm.train.task import DrawnTask
 else:
@@ -21,11 +24,15 @@ else:
         "Lessons": "qsgm.train.quantization.lessons",
         "PretrainConfig": "qsgm.train.pretraining.pretrain",
         "SlimReport": "qsgm.train.slim",
+        "build": "qsgm.train.samples.build",
         "export_bundle": "qsgm.train.export",
+        "from_torch": "qsgm.train.model.from_torch",
         "load_checkpoint": "qsgm.train.checkpoint",
         "pretrain": "qsgm.train.pretraining.pretrain",
+        "quicker": "qsgm.train.samples.drawn",
         "save_checkpoint": "qsgm.train.checkpoint",
         "slim_bundle": "qsgm.train.slim",
+        "usual_config": "qsgm.train.samples.drawn",
     }
 
     def __getattr__(name: str) -> object:
@@ -42,9 +49,13 @@ __all__ = [
     "Lessons",
     "PretrainConfig",
     "SlimReport",
+    "build",
     "export_bundle",
+    "from_torch",
     "load_checkpoint",
     "pretrain",
+    "quicker",
     "save_checkpoint",
     "slim_bundle",
+    "usual_config",
 ]

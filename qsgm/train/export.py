@@ -71,7 +71,7 @@ TRUNK: Precision = "float"
 # Folding moves rounding errors about, no more: larger than this, it went wrong.
 LARGEST_FOLD_ERROR = 1e-4  # relative to the largest output
 FOLD_SAMPLES = 64
-# As many as were meta-trained together, and for which the gain of short runs was found.
+# As many as were meta-trained together, unless the checkpoint's curvatures say otherwise.
 MAML_LAYERS = 3
 
 
@@ -367,9 +367,8 @@ def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Re
         name: {str(one): (optimizer.rate,) * len(one.layers) for one in whole}
         for name, optimizer in OPTIMIZERS.items()
     }
-    gains = {
-        str(one): checkpoint.short_gain if len(one.layers) >= MAML_LAYERS else 1.0 for one in blocks
-    }
+    late = len(checkpoint.curvatures) or MAML_LAYERS  # for which the gain of short runs was found
+    gains = {str(one): checkpoint.short_gain if len(one.layers) >= late else 1.0 for one in blocks}
     return {"sgm": Recipes("sgd", sgm, gains), "bp": Recipes("adam", bp)}
 
 

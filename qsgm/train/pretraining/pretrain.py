@@ -10,11 +10,13 @@ A task may add a last stage of its own. What is done so far is kept beside the o
 `<output>.partial` and taken up again by the same version's same command: output, seed and device.
 """
 
+import hashlib
 import json
 import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
 from pathlib import Path
@@ -104,6 +106,7 @@ def pretrain(
     config: PretrainConfig | None = None,
     last_stage: LastStage | None = None,
     arguments: str = "",
+    trained: ConvNet | None = None,
 ) -> Checkpoint:
     """Pretrain and write `output`.
 
@@ -116,6 +119,7 @@ def pretrain(
         config: sizes; the default makes the shipped checkpoint.
         last_stage: of the task's own.
         arguments: that the same command takes for the task, such as ` --encoding paper`.
+        trained: a network that is trained already, instead of the first stage.
 
     Raises:
         QsgmError: the device is not there, `output` cannot be written, or training diverged:
@@ -125,8 +129,13 @@ def pretrain(
     _check_device(device)
     _check_output(output)
     extra = {} if last_stage is None else last_stage.to_json()
-    partial = Partial.open(output, _identity(task, seed, device, config, extra))
-    net = _backbone(partial, config, task, seed, device, watch)
+    identity = _identity(task, seed, device, config, extra)
+    if trained is None:
+        partial = Partial.open(output, identity)
+        net = _backbone(partial, config, task, seed, device, watch)
+    else:
+        partial = Partial.open(output, identity | {"trained": _digest(trained)})
+        net = _portable(deepcopy(trained))  # meta-training gives it a new start
     with one_thread():
         learnt = _learn(partial, net, task, config, seed, watch)
         done = task if last_stage is None else last_stage(learnt, seed, watch)
@@ -191,6 +200,14 @@ def _identity(
         "config": repr((config, extra)),
         "task": repr(task),
     }
+
+
+def _digest(net: ConvNet) -> str:
+    """Of a network's weights."""
+    digest = hashlib.sha256()
+    for name, value in net.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _backbone(

@@ -1,0 +1,140 @@
+"""What the commands do for networks of one's own; see :mod:`qsgm.samples`."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from qsgm.cli.console import host_module, print_json, progress, show, tell
+from qsgm.errors import QsgmError, as_text
+from qsgm.files import read_file
+
+if TYPE_CHECKING:
+    from qsgm.bundle import Bundle
+    from qsgm.samples.task import SampleTask
+    from qsgm.samples.teach import SamplesResult
+    from qsgm.tune.settings import Settings
+
+TaskOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--task", metavar="FILE.py", help="A network of your own: what defines it; default: grasp."
+    ),
+]
+_MOST_BYTES = 1_000_000
+
+
+def pretrain_task(
+    file: Path, output: Path, seed: int, device: str, chosen: dict[str, Any], as_json: bool
+) -> None:
+    """`qsgm pretrain --task`."""
+    task = _host_task(file)
+    host = host_module("qsgm.train.samples.build")
+    sizes = host.usual_config(task, **chosen)
+    source = hashlib.sha256(read_file(file, _MOST_BYTES, "a task file")).hexdigest()
+    with progress() as watch:
+        said = f" --task {as_text(file.name)}"
+        host.pretrain_samples(task, output, seed, device, watch, sizes, None, said, source)
+    if as_json:
+        values = {"output": str(output), "seed": seed, "device": device, "task": task.name}
+        print_json(values)
+    else:
+        tell("pretrained", output)
+
+
+def export_task(
+    file: Path, checkpoint: Path, output: Path, chosen: dict[str, Any], as_json: bool
+) -> None:
+    """`qsgm fold-and-quantize --task`."""
+    task = _host_task(file)
+    host = host_module("qsgm.train.samples.build")
+    options = host.ExportOptions(epochs=host.USUAL.epochs, **chosen)
+    with progress() as watch:
+        report = host.export_samples(task, checkpoint, output, watch, options)
+    show(report.to_json(), report, as_json)
+
+
+def is_of_samples(bundle: "Bundle", file: Path | None) -> bool:
+    """Whether a bundle is tuned on samples, not on frames that show an object."""
+    from qsgm.samples.taskfile import GRASP
+
+    return file is not None or bundle.manifest.task.name != GRASP
+
+
+def learn_task(
+    file: Path | None,
+    shown: Sequence[Path],
+    bundle: "Bundle",
+    settings: "Settings",
+    *,
+    usual_layers: bool,
+) -> "SamplesResult":
+    """`qsgm finetune` with a bundle of samples."""
+    from qsgm.samples.taskfile import task_of_bundle
+    from qsgm.samples.teach import learn, usual_settings
+
+    task = task_of_bundle(bundle, _device_task(file))
+    settings = usual_settings(bundle, task, settings) if usual_layers else settings
+    samples = [task.read(path) for path in shown]
+    with progress() as watch:
+        return learn(samples, bundle, task, settings, watch)
+
+
+def show_learnt(result: "SamplesResult", folder: Path, name: str, as_json: bool) -> None:
+    """Scores by name, fidelity, seconds."""
+    from qsgm.samples.report import learnt_json, learnt_report
+
+    show(learnt_json(result, name, folder), learnt_report(result, name), as_json)
+
+
+def predict_task(
+    folder: Path, file: Path | None, samples: Path, threads: int, as_json: bool
+) -> bool:
+    """`qsgm predict` with a tuned network; False where the folder is grasping's."""
+    from qsgm.samples.arrays import ArraysTask
+    from qsgm.samples.report import answers_json, answers_table
+    from qsgm.samples.taskfile import task_for, tuned_of
+    from qsgm.samples.tuned import load_network, task_named_in
+
+    if task_named_in(folder) is None:
+        if file is not None:
+            raise QsgmError(f"{folder} is of the task 'grasp', which takes no --task")
+        return False
+    network = load_network(folder, threads)
+    kept, given = network.task, _device_task(file)
+    task: SampleTask = ArraysTask(kept.name, kept.network, kept.heads, tuned_of(kept))
+    if given is not None:
+        task = task_for(kept, f"the tuned network {folder}", given)
+    seen = task.read(samples)
+    outputs = network.answers(seen.inputs)
+    scores = None if seen.labels is None else task.scores(outputs, seen.labels)
+    values = answers_json(network.name, kept.name, kept.heads, outputs, scores)
+    show(values, answers_table(network.name, kept.heads, outputs, scores), as_json)
+    return True
+
+
+def refuse_options(**given: bool) -> None:
+    """Refuse what concerns grasping only. Raises QsgmError."""
+    for name, there in given.items():
+        if there:
+            option = f"--{name.strip('_').replace('_', '-')}"
+            raise QsgmError(f"{option} concerns the task `grasp` only; leave it out")
+
+
+def _device_task(file: Path | None) -> "SampleTask | None":
+    """What a task file defines; None without one, and for the built-in one's JSON file."""
+    from qsgm.samples.taskfile import load_task
+
+    return None if file is None or file.suffix == ".json" else load_task(file)
+
+
+def _host_task(file: Path) -> "SampleTask":
+    """What is pretrained and exported."""
+    if file.suffix == ".json":
+        found: SampleTask = host_module("qsgm.train.samples.arrays").load_arrays_task(file)
+        return found
+    from qsgm.samples.taskfile import load_task
+
+    return load_task(file)

@@ -1,0 +1,123 @@
+"""A tuned network: a folder with a stand-alone ONNX network, what it is for, and the report."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+from qsgm.files import new_folder, read_file, read_whole
+from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
+from qsgm.network import Network
+from qsgm.runtime import Value, check_interface, open_session, running
+from qsgm.samples.lesson import Samples, checked_samples
+from qsgm.task import Array, Inputs, TaskRecord, heads_from_json, heads_to_json, output_count
+
+FORMAT = "qsgm-object"
+VERSION = 2
+DESCRIPTION = "object.json"
+REPORT = "report.json"
+MOST_BYTES = 256_000_000
+_COMMAND = "qsgm finetune -o DIR"
+_ADVICE = "tune it again with `qsgm finetune`"
+
+
+class TunedNetwork:
+    """A tuned network, ready to answer."""
+
+    def __init__(self, name: str, task: TaskRecord, network: bytes, threads: int = 1) -> None:
+        self.name, self.task = name, task
+        what, pixels = f"the network of {name!r}", task.network.input_kind == "pixels"
+        kind = "tensor(uint8)" if pixels else "tensor(float)"
+        takes: dict[str, Value] = {"frame": (kind, (None, None, task.network.input_shape[2]))}
+        gives: dict[str, Value] = {"heatmap": ("tensor(float)", (task.network.outputs, None, None))}
+        self._session = open_session(network, threads, name=what)
+        check_interface(self._session, what, takes, gives, _ADVICE)
+
+    def answers(self, inputs: Inputs) -> Array:
+        """Activated outputs (N, L) for samples (N, H, W, C).
+
+        Raises:
+            QsgmError: the samples are others, or the network's answers are not finite.
+        """
+        task = self.task
+        seen = checked_samples(Samples(inputs), task.network, task.heads, "the samples").inputs
+        with running(f"the tuned network {self.name!r}", _ADVICE):
+            maps = [self._session.run(["heatmap"], {"frame": one})[0] for one in seen]
+        if not all(one.shape == (task.network.outputs, 1, 1) for one in maps):
+            raise QsgmError(f"{self.name!r} answers {maps[0].shape} numbers to a sample; {_ADVICE}")
+        outputs: NDArray[np.float32] = np.stack(maps)[:, :, 0, 0]
+        if not np.isfinite(outputs).all():
+            raise QsgmError(f"{self.name!r} answers with NaN or infinity; {_ADVICE}")
+        return outputs
+
+
+def save_network(
+    folder: Path,
+    task: TaskRecord,
+    network: bytes,
+    name: str,
+    made: Mapping[str, Any],
+    report: Mapping[str, Any],
+) -> None:
+    """Write a tuned network; it appears complete or not at all. Raises QsgmError."""
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": name,
+        "task": {"name": task.name, **task.settings},
+        "network": task.network.to_json(),
+        "heads": heads_to_json(task.heads),
+        "sha256": hashlib.sha256(network).hexdigest(),
+        "made": dict(made),
+    }
+    with new_folder(folder, DESCRIPTION) as new:
+        (new / NETWORK).write_bytes(network)
+        for file, values in ((DESCRIPTION, description), (REPORT, report)):
+            text = json.dumps(values, indent=1, allow_nan=False)
+            (new / file).write_text(text + "\n", encoding="utf-8")
+
+
+def task_named_in(folder: Path) -> str | None:
+    """The task of a tuned network; None for a tuned object of grasping, or what is neither."""
+    try:
+        values = json.loads(read_file(folder / DESCRIPTION, MANIFEST_BYTES, "a tuned network"))
+        return str(values["task"]["name"])
+    except (QsgmError, ValueError, LookupError, TypeError, RecursionError, AttributeError):
+        return None
+
+
+def load_network(folder: Path, threads: int = 1) -> TunedNetwork:
+    """Read a tuned network, trusting nothing in it.
+
+    Raises:
+        QsgmError: something is missing or altered, or this is no tuned network.
+    """
+    return read_whole(folder, lambda: _load(folder, threads))
+
+
+def _load(folder: Path, threads: int) -> TunedNetwork:
+    path = folder / DESCRIPTION
+    data = read_file(path, MANIFEST_BYTES, "a tuned network")
+    values = parse_description(data, path, FORMAT, (VERSION,), _COMMAND)
+    keys = {"name": str, "task": dict, "network": dict, "heads": list, "sha256": str}
+    require_keys(path, values, keys, _COMMAND)
+    settings = dict(values["task"])
+    require_keys(path, settings, {"name": str}, _COMMAND)
+    try:
+        network, heads = Network.from_json(values["network"]), heads_from_json(values["heads"])
+        if output_count(heads) != network.outputs:
+            raise QsgmError("the heads are not the network's")
+    except QsgmError as error:
+        raise QsgmError(f"{path}: {error}; {_ADVICE}") from error
+    content = read_file(folder / NETWORK, MOST_BYTES, "a tuned network's graph")
+    if hashlib.sha256(content).hexdigest() != values["sha256"]:
+        raise QsgmError(
+            f"{folder / NETWORK} is not the file it was (its sha256 differs); {_ADVICE}"
+        )
+    task = TaskRecord(settings.pop("name"), network, heads, settings)
+    return TunedNetwork(values["name"], task, content, threads)

@@ -1,0 +1,190 @@
+"""A network of somebody's own goes the whole way, by the command line and from Python: the digits.
+
+examples/digits in small: enough to beat chance by far.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import qsgm
+from qsgm import QsgmError, Samples, SampleTask, cli, learn, load_bundle, load_network, load_task
+from qsgm.train import from_torch
+from qsgm.train.samples import build as building
+from qsgm.train.samples.drawn import quicker, usual_config
+
+EXAMPLES = Path(qsgm.__file__).parent.parent / "examples" / "digits"
+FILE = EXAMPLES / "digits_task.py"
+
+
+def small(task: SampleTask, **chosen: Any) -> Any:
+    return quicker(usual_config(task, **chosen), 0.1)
+
+
+def samples(path: Path, count: int = 250) -> Path:
+    met = digits().met(np.random.default_rng(5), count)
+    np.savez(path, samples=met.inputs, labels=met.labels)
+    return path
+
+
+def digits() -> Any:
+    return load_task(FILE)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint and a bundle, as the command line makes them."""
+    folder = tmp_path_factory.mktemp("digits")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "usual_config", small)
+        patch.setattr(building, "USUAL", building.ExportOptions(epochs=1))
+        task = ["--task", str(FILE)]
+        kept, bundle = str(folder / "mine.pt"), str(folder / "mine")
+        assert cli.run(["pretrain", *task, "-o", kept]) == 0
+        assert cli.run(["fold-and-quantize", kept, *task, "-o", bundle]) == 0
+    return folder
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert cli.run([str(one) for one in arguments]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    return err
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    capsys.readouterr()
+    assert cli.run([*map(str, arguments), "--json"]) == 0
+    values: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return values
+
+
+def test_a_task_file_is_short_and_needs_no_torch() -> None:
+    assert len(FILE.read_text().splitlines()) <= 80
+    code = f"import sys, qsgm, pathlib; qsgm.load_task(pathlib.Path({str(FILE)!r})); "
+    code += "sys.exit(any(name in sys.modules for name in ('torch', 'onnx', 'sklearn')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_bundle_names_its_task_and_holds_no_code(made: Path) -> None:
+    manifest = json.loads((made / "mine" / "manifest.json").read_text())
+    assert manifest["task"] == {"name": "digits", "tuned": 2}
+    assert not [one for one in (made / "mine").iterdir() if one.suffix == ".py"]
+
+
+def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, tuned = samples(tmp_path / "hand.npz"), tmp_path / "tuned"
+    told = ["--bundle", made / "mine", "--task", FILE, "--int8", "-o", tuned]
+    report = printed(capsys, "finetune", *told, path)
+    assert report["task"] == "digits"
+    assert report["layers"] == 2
+    assert report["samples"] == {"taught": 200, "held_out": 50}
+    before = report["zero_shot"]["digit_accuracy"]
+    assert report["scores"]["digit_accuracy"] > max(0.6, before + 0.4)
+    assert report["fidelity"]["3"]["cos_int8_float"] > 0.999
+    answers = printed(capsys, "predict", "--object", tuned, path)
+    assert (answers["object"], answers["task"], answers["samples"]) == ("hand", "digits", 250)
+    assert len(answers["outputs"]) == 250
+    assert sum(answers["outputs"][0]["digit"]) == pytest.approx(1, abs=1e-3)
+    assert "center_px" not in answers
+    assert (
+        answers["scores"]
+        == printed(capsys, "predict", "--object", tuned, "--task", FILE, path)["scores"]
+    )
+    assert cli.run(["predict", str(path)]) == 0  # the last one tuned
+    assert "digit_accuracy" in capsys.readouterr().out
+
+
+def test_without_its_task_a_bundle_is_refused_in_one_line(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], bundle_folder: Path
+) -> None:
+    path, own = samples(tmp_path / "hand.npz"), ["--bundle", made / "mine"]
+    assert "pass --task FILE.py" in refused(capsys, "finetune", *own, path)
+    task = ["--task", FILE]
+    assert "'grasp'" in refused(capsys, "finetune", "--bundle", bundle_folder, *task, path)
+    assert "--center concerns" in refused(capsys, "finetune", *own, *task, "--center", "1,1", path)
+    assert "pass --task" in refused(capsys, "fold-and-quantize", made / "mine.pt")
+    assert "--encoding concerns" in refused(capsys, "pretrain", *task, "--encoding", "paper")
+    assert not (Path(path).parent / "data").exists()
+
+
+def test_the_built_in_task_takes_a_bundle_of_arrays_without_a_file(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle = Path(shutil.copytree(made / "mine", tmp_path / "arrays"))
+    text = (bundle / "manifest.json").read_text()
+    (bundle / "manifest.json").write_text(text.replace('"digits"', '"arrays"'))
+    path = samples(tmp_path / "hand.npz")
+    told = ["--bundle", bundle, "-o", tmp_path / "tuned"]
+    report = printed(capsys, "finetune", *told, path)
+    assert report["scores"]["digit_accuracy"] > 0.6
+
+
+def test_three_lines_on_a_device_do_as_the_command_line(made: Path, tmp_path: Path) -> None:
+    task, bundle = digits(), load_bundle(made / "mine")
+    result = learn(task.read(samples(tmp_path / "hand.npz")), bundle, task)
+    result.save(tmp_path / "tuned", "hand")
+    asked = task.met(np.random.default_rng(5), 20)
+    again = load_network(tmp_path / "tuned").answers(asked.inputs)
+    np.testing.assert_array_equal(again, result.tuned_network().answers(asked.inputs))
+    with pytest.raises(QsgmError, match="samples are float32"):
+        result.tuned_network().answers(asked.inputs.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("heads", []), ("network", {}), ("task", {"name": 3}), ("sha256", "0")]
+)
+def test_a_damaged_tuned_network_is_refused(
+    made: Path, tmp_path: Path, key: str, value: object
+) -> None:
+    task = digits()
+    learn(task.read(samples(tmp_path / "hand.npz", 40)), load_bundle(made / "mine"), task).save(
+        tmp_path / "tuned", "hand"
+    )
+    path = tmp_path / "tuned" / "object.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(QsgmError) as caught:
+        load_network(tmp_path / "tuned")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_trained_network_is_taken_as_it_is(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    module = nn.Sequential(
+        nn.Conv2d(1, 8, 3, padding=1), nn.ReLU(), nn.AvgPool2d(2), nn.Flatten(), nn.Linear(128, 10)
+    )
+    net = from_torch(module, (8, 8, 1), "pixels")
+    start = {name: value.clone() for name, value in net.state_dict().items()}
+    task = type(digits())("digits", net.network, digits().heads)
+    options, config = building.ExportOptions(epochs=1), small(task)
+    building.build(task, tmp_path / "own", net, config=config, options=options)
+    assert all(torch.equal(value, start[name]) for name, value in net.state_dict().items())
+    assert load_bundle(tmp_path / "own").network == net.network
+    assert (tmp_path / "own.pt").is_file()
+    with pytest.raises(QsgmError, match="is not the one of the task"):
+        building.build(digits(), tmp_path / "other", net, config=config)
+
+
+def test_a_task_that_draws_what_does_not_fit_is_refused_before_any_work(tmp_path: Path) -> None:
+    class Short(type(digits())):  # type: ignore[misc]
+        def example(self, rng: np.random.Generator, count: int) -> Samples:
+            drawn: Samples = self.draw(rng, count - 1)
+            return drawn
+
+    task = Short("short", digits().network, digits().heads)
+    with pytest.raises(QsgmError, match=r"`example` of the task 'short' gives 23 samples"):
+        building.build(task, tmp_path / "own")
+    assert not (tmp_path / "own").exists()

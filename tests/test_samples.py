@@ -1,0 +1,216 @@
+"""Samples, task files and tuned networks: what is taken, and what is refused in one line."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qsgm import Head, Network, QsgmError, Samples, SampleTask, conv, load_task
+from qsgm.samples.arrays import NAME, ArraysTask, read_npz
+from qsgm.samples.lesson import head_scores, lesson_of
+from qsgm.samples.taskfile import task_for
+from qsgm.task import TaskRecord, task_record
+
+NETWORK = Network((2, 3, 1), (conv(1, 4, (2, 3)), conv(4, 3, relu=False)), "numbers")
+HEADS = (Head("kind", "cross_entropy", 3, "softmax"),)
+TASK = ArraysTask(NAME, NETWORK, HEADS)
+FILE = """
+from qsgm import Head, Network, SampleTask, conv
+task = SampleTask(
+    "mine",
+    Network((2, 3, 1), (conv(1, 4, (2, 3)), conv(4, 3, relu=False)), "numbers"),
+    (Head("kind", "cross_entropy", 3, "softmax"),),
+)
+"""
+
+
+def inputs(count: int = 10) -> np.ndarray[Any, Any]:
+    return np.random.default_rng(0).normal(size=(count, 2, 3, 1)).astype(np.float32)
+
+
+def saved(path: Path, **arrays: Any) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+def refused(call: Callable[[], object]) -> str:
+    with pytest.raises(QsgmError) as caught:
+        call()
+    message = str(caught.value)
+    assert message
+    assert "\n" not in message
+    return message
+
+
+def test_classes_and_labels_are_the_same_samples(tmp_path: Path) -> None:
+    classes = np.arange(10) % 3
+    one = TASK.read(saved(tmp_path / "a.npz", samples=inputs(), labels=classes))
+    labels = np.eye(3, dtype=np.float32)[classes]
+    other = TASK.read(saved(tmp_path / "b.npz", samples=inputs(), labels=labels))
+    assert one.labels is not None
+    np.testing.assert_array_equal(one.labels, labels)
+    assert other.labels is not None
+    np.testing.assert_array_equal(other.labels, labels)
+    np.testing.assert_array_equal(one.inputs, inputs())
+
+
+def test_packed_arrays_in_any_order_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "packed.npz"
+    np.savez_compressed(path, samples=np.asfortranarray(inputs()), more=np.zeros(3))
+    np.testing.assert_array_equal(TASK.read(path).inputs, inputs())
+    assert TASK.read(path).labels is None
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"labels": np.arange(10) % 3}, "holds no `samples`"),
+        ({"samples": inputs().astype(np.float64)}, "float64"),
+        ({"samples": inputs()[:, :1]}, "expected float32 (N, 2, 3, 1)"),
+        ({"samples": inputs()[:0]}, "expected float32 (N, 2, 3, 1)"),
+        ({"samples": np.full((2, 2, 3, 1), np.nan, np.float32)}, "NaN"),
+        ({"samples": inputs(), "labels": np.arange(10)}, "classes from 0 to 9, expected 0 to 2"),
+        ({"samples": inputs(), "labels": np.zeros(9, int)}, "labels are float32 (9, 3)"),
+        ({"samples": inputs(), "labels": np.full((10, 3), 2, np.float32)}, "outside"),
+        ({"samples": inputs(), "labels": np.full((10, 3), np.nan, np.float32)}, "outside"),
+        ({"samples": np.array([{}], object)}, "no numbers"),
+        ({"samples": np.array(["text"])}, "no numbers"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(
+    tmp_path: Path, arrays: dict[str, Any], said: str
+) -> None:
+    path = saved(tmp_path / "bad.npz", **arrays)
+    message = refused(lambda: TASK.read(path))
+    assert said in message
+    assert "bad.npz" in message
+
+
+def test_an_archive_that_says_more_than_it_holds_is_refused_before_it_is_unpacked(
+    tmp_path: Path,
+) -> None:
+    header = io.BytesIO()
+    shape = (10**9, 2, 3, 1)
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
+    path = tmp_path / "large.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("samples.npy", header.getvalue() + bytes(24))
+    assert "which is not in it" in refused(lambda: TASK.read(path))
+
+
+@pytest.mark.parametrize("cut", [0, 10, 200])
+def test_a_damaged_archive_is_refused(tmp_path: Path, cut: int) -> None:
+    path = saved(tmp_path / "cut.npz", samples=inputs())
+    path.write_bytes(path.read_bytes()[:cut])
+    assert "cannot be read" in refused(lambda: TASK.read(path))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_flipped_byte_is_read_or_refused_and_nothing_else(tmp_path: Path, seed: int) -> None:
+    path, rng = saved(tmp_path / "flip.npz", samples=inputs()), np.random.default_rng(seed)
+    data = bytearray(path.read_bytes())
+    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(data)
+    with suppress(QsgmError):
+        read_npz(path, ("samples",))
+
+
+def test_a_fifth_of_the_samples_is_held_out_and_all_are_there() -> None:
+    labels = np.eye(3, dtype=np.float32)[np.arange(10) % 3]
+    lesson = lesson_of(TASK, [Samples(inputs(), labels)], np.random.default_rng(1))
+    assert (len(lesson), lesson.taught) == (10, 8)
+    assert sorted(lesson.inputs.ravel()) == sorted(inputs().ravel())
+    assert "need labels" in refused(
+        lambda: lesson_of(TASK, [Samples(inputs())], np.random.default_rng(1))
+    )
+    one = Samples(inputs(1), labels[:1])
+    assert "1 sample" in refused(lambda: lesson_of(TASK, [one], np.random.default_rng(1)))
+
+
+def test_scores_go_by_the_names_of_heads_and_count_where_a_head_counts() -> None:
+    heads = (
+        Head("there", "log_loss", 1, "sigmoid"),
+        Head("way", "squared", 1, "tanh", where=0),
+        Head("kind", "cross_entropy", 2, "softmax"),
+    )
+    outputs = np.array([[0.9, 0.5, 0.7, 0.3], [0.8, 0.0, 0.4, 0.6]], np.float32)
+    labels = np.array([[1, 1, 1, 0], [0, 0, 1, 0]], np.float32)
+    scores = head_scores(heads, outputs, labels)
+    assert scores == {"there_accuracy": 0.5, "way_error": 0.5, "kind_accuracy": 0.5}
+    assert head_scores(heads, outputs[1:], labels[1:])["way_error"] is None
+
+
+def test_a_task_file_is_read_and_its_classes_are_found_again(tmp_path: Path) -> None:
+    path = tmp_path / "my task.py"
+    path.write_text(FILE)
+    task = load_task(path)
+    assert (task.name, task.network, task.heads) == ("mine", NETWORK, HEADS)
+    assert "how x.npz is read" in refused(lambda: task.read(Path("x.npz")))
+    assert "nothing to pretrain on" in refused(lambda: task.draw(np.random.default_rng(0), 1))
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (None, "does not exist"),
+        ("", "`task` is nothing"),
+        ("task = 3", "`task` is a int"),
+        ("import nothing_at_all", "ModuleNotFoundError in line 1: No module named"),
+        ("\nif", "SyntaxError in line 2"),
+        ("\n\nraise ValueError('one\\ntwo')", "ValueError in line 3: one"),
+        (FILE.replace('"mine"', '"grasp"'), "no name for a task"),
+        (FILE.replace('"mine"', '"a b"'), "no name for a task"),
+        (FILE.replace('"mine"', "5"), "`task.name` is a int"),
+        (FILE.replace("4, 3, relu", "4, 2, relu"), "have 3 channels, its network gives 2"),
+    ],
+)
+def test_a_task_file_that_is_none_is_refused_in_one_line(
+    tmp_path: Path, source: str | None, said: str
+) -> None:
+    path = tmp_path / "bad.py"
+    if source is not None:
+        path.write_text(source)
+    assert said in refused(lambda: load_task(path))
+
+
+def test_another_tasks_file_is_refused_and_so_is_none() -> None:
+    kept = TaskRecord("mine", NETWORK, HEADS, {})
+    mine, yours = SampleTask("mine", NETWORK, HEADS), SampleTask("yours", NETWORK, HEADS)
+    assert task_for(kept, "it", mine) is mine
+    assert "pass --task FILE.py" in refused(lambda: task_for(kept, "it", None))
+    assert "the task file of 'yours'" in refused(lambda: task_for(kept, "it", yours))
+    heads = (Head("other", "cross_entropy", 3, "softmax"),)
+    other = SampleTask("mine", NETWORK, heads)
+    assert "another network or other heads" in refused(lambda: task_for(kept, "it", other))
+    built_in = task_for(task_record(TASK), "it", None)
+    assert isinstance(built_in, ArraysTask)
+    assert built_in.heads == HEADS
+
+
+def test_a_pool_of_arrays_is_drawn_group_by_group(tmp_path: Path) -> None:
+    from qsgm.train.samples.arrays import load_arrays_task
+
+    groups = np.repeat([4, 9], 5)
+    saved(tmp_path / "pool.npz", samples=inputs(), labels=np.arange(10) % 3, groups=groups)
+    heads = json.loads(
+        '[{"name": "kind", "kind": "cross_entropy", "channels": 3, "activation": '
+        '"softmax", "weight": 1, "smoothing": 0, "where": null}]'
+    )
+    about = {"network": NETWORK.to_json(), "heads": heads, "tuned": 1, "samples": "pool.npz"}
+    path = tmp_path / "pool.json"
+    path.write_text(json.dumps(about))
+    task, rng = load_arrays_task(path), np.random.default_rng(0)
+    assert (task.name, task.tuned) == (NAME, 1)
+    drawn = [task.draw(rng, 20).inputs for _ in range(10)]
+    halves = [set(inputs()[:5].ravel()), set(inputs()[5:].ravel())]
+    assert all(any(set(one.ravel()) <= half for half in halves) for one in drawn)
+    path.write_text("{}")
+    assert "is no task `arrays`" in refused(lambda: load_arrays_task(path))
