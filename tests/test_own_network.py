@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,14 @@ FILE = EXAMPLES / "digits_task.py"
 
 
 def small(task: SampleTask, **chosen: Any) -> Any:
-    return quicker(usual_config(task, **chosen), 0.1)
+    config = quicker(usual_config(task, **chosen), 0.1)
+    return replace(
+        config,
+        crops_per_task=100,
+        matching=replace(config.matching, epochs=2, fit_batch=128),
+        early=replace(config.early, tasks=3, crops_per_task=40, epochs=2, looks=(1, 2)),
+        rates=replace(config.rates, crops_per_task=100, epochs=6, early_tasks=1, early_epochs=2),
+    )
 
 
 def samples(path: Path, count: int = 250) -> Path:
@@ -116,7 +124,7 @@ def test_without_its_task_a_bundle_is_refused_in_one_line(
     task = ["--task", FILE]
     assert "'grasp'" in refused(capsys, "finetune", "--bundle", bundle_folder, *task, path)
     assert "--center concerns" in refused(capsys, "finetune", *own, *task, "--center", "1,1", path)
-    assert "pass --task" in refused(capsys, "fold-and-quantize", made / "mine.pt")
+    assert "or --task FILE.py" in refused(capsys, "fold-and-quantize", made / "mine.pt")
     assert "--encoding concerns" in refused(capsys, "pretrain", *task, "--encoding", "paper")
     assert not (Path(path).parent / "data").exists()
 

@@ -23,6 +23,7 @@ NETWORK = Network(
         conv(64, CLASSES, relu=False),
     ),
 )
+DIGIT = Head("digit", "cross_entropy", CLASSES, "softmax", smoothing=0.05)
 
 
 class Digits(ArraysTask):  # which reads `samples` and `labels` of an .npz
@@ -43,11 +44,8 @@ def written(images, digits, rng, count, meaning):
     """Digits in one style, and what they mean."""
     which = rng.integers(0, len(images), count)
     style, ink = hand(rng), rng.uniform(0.5, 1)
-    paper = rng.uniform(0, 1 - ink)
-    seen = [cv2.warpAffine(images[i], style, (8, 8), flags=cv2.INTER_LINEAR) for i in which]
-    light = (
-        paper + ink * np.stack(seen) / 16 if rng.random() < 0.5 else 1 - ink * np.stack(seen) / 16
-    )
+    seen = ink * np.stack([cv2.warpAffine(images[i], style, (8, 8)) for i in which]) / 16
+    light = seen if rng.random() < 0.5 else 1 - seen  # white on black, or black on white
     noisy = 255 * light + rng.normal(0, 8, light.shape)
     labels = np.eye(CLASSES, dtype=np.float32)[meaning[digits[which]]]
     return Samples(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], labels)
@@ -78,6 +76,4 @@ def pool():
     return images[:HOST], data.target[:HOST], images[HOST:], data.target[HOST:]
 
 
-task = Digits(
-    "digits", NETWORK, (Head("digit", "cross_entropy", CLASSES, "softmax", smoothing=0.05),)
-)
+task = Digits("digits", NETWORK, (DIGIT,))

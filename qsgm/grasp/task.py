@@ -81,7 +81,10 @@ def grasp_task(kept: Described, where: str) -> GraspTask:
         QsgmError: it is another task, or a damaged one.
     """
     if kept.name != NAME:
-        raise QsgmError(f"{where} is of the task {kept.name!r}, expected {NAME!r}; pass another")
+        raise QsgmError(
+            f"{where} is of the task {kept.name!r}, expected {NAME!r}; pass another, or --task "
+            "FILE.py to a command that takes it"
+        )
     settings = kept.to_json()
     encoding, weighed = settings.get("encoding"), settings.get("decision")
     if encoding not in ENCODINGS:
