@@ -28,13 +28,8 @@ FILE = EXAMPLES / "digits_task.py"
 
 def small(task: SampleTask, **chosen: Any) -> Any:
     config = quicker(usual_config(task, **chosen), 0.1)
-    return replace(
-        config,
-        crops_per_task=100,
-        matching=replace(config.matching, epochs=2, fit_batch=128),
-        early=replace(config.early, tasks=3, crops_per_task=40, epochs=2, looks=(1, 2)),
-        rates=replace(config.rates, crops_per_task=100, epochs=6, early_tasks=1, early_epochs=2),
-    )
+    early = replace(config.early, tasks=3, crops_per_task=40, epochs=2, looks=(1, 2))
+    return replace(config, early=early)
 
 
 def samples(path: Path, count: int = 250) -> Path:

@@ -21,7 +21,7 @@ from qsgm.train.pretraining.rates import RatesConfig
 CALIBRATION_LESSONS = 8
 HIDDEN = (32, 32)
 # Of the layers that are meta-trained, the last one first: each in front of it learns slower.
-_RATES = (2e-1, 1e-2, 3e-3)
+_RATES = (1e-1, 5e-3, 2e-3)
 
 
 @dataclass(frozen=True)
