@@ -18,6 +18,7 @@ from torch import nn
 
 import qsgm
 from qsgm import QsgmError, Samples, SampleTask, cli, learn, load_bundle, load_network, load_task
+from qsgm.task import heads_to_json
 from qsgm.train import from_torch
 from qsgm.train.samples import build as building
 from qsgm.train.samples.drawn import quicker, usual_config
@@ -107,6 +108,8 @@ def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
         answers["scores"]
         == printed(capsys, "predict", "--object", tuned, "--task", FILE, path)["scores"]
     )
+    assert "--all concerns" in refused(capsys, "predict", "--object", tuned, "--all", path)
+    assert "--output concerns" in refused(capsys, "predict", "-o", tmp_path / "a.png", path)
     assert cli.run(["predict", str(path)]) == 0  # the last one tuned
     assert "digit_accuracy" in capsys.readouterr().out
 
@@ -191,3 +194,19 @@ def test_a_task_that_draws_what_does_not_fit_is_refused_before_any_work(tmp_path
     with pytest.raises(QsgmError, match=r"`example` of the task 'short' gives 23 samples"):
         building.build(task, tmp_path / "own")
     assert not (tmp_path / "own").exists()
+
+
+def test_an_array_of_samples_is_pretrained_on_as_a_json_file_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples(tmp_path / "pool.npz", 30)
+    task, seen = digits(), list[Any]()
+    about = {"network": task.network.to_json(), "heads": heads_to_json(task.heads)}
+    (tmp_path / "pool.json").write_text(json.dumps(about | {"samples": "pool.npz"}))
+    monkeypatch.setattr(building, "pretrain_samples", lambda *given: seen.append(given))
+    arguments = ["pretrain", "--task", str(tmp_path / "pool.json"), "--hidden", "8", "--json"]
+    assert cli.run([*arguments, "-o", str(tmp_path / "mine.pt")]) == 0
+    taken, config = seen[0][0], seen[0][5]
+    assert (taken.name, taken.network, taken.heads) == ("arrays", task.network, task.heads)
+    assert config.hidden == (8,)
+    assert len(taken.draw(np.random.default_rng(0), 50)) == 50

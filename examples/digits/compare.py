@@ -1,6 +1,6 @@
 """Untouched, int8 SGMs, float SGMs, backpropagation at its best: on devices of their own.
 
-python examples/digits/compare.py mine [LAYERS]
+python examples/digits/compare.py mine [LAYERS [hand]]     # hand: digits mean what they are
 
 Backpropagation takes the best of a grid of rates for every number of epochs, chosen on other
 devices than those reported on.
@@ -22,12 +22,12 @@ EPOCHS = (1, 3, 20)
 OPTIMIZERS, RATES = ("sgd", "adam"), (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)
 
 
-def main(folder, layers=None):
+def main(folder, layers="2", what="both"):
     """A row per method, a column per number of epochs."""
     task, bundle = load_task(Path(__file__).with_name("digits_task.py")), load_bundle(Path(folder))
-    layers = layers or task.tuned
-    devices = [device(task, seed) for seed in range(DEVICES)]
-    others = [device(task, 1000 + seed) for seed in range(CHOSEN_ON)]
+    layers, meant = int(layers), what != "hand"
+    devices = [device(task, seed, meant) for seed in range(DEVICES)]
+    others = [device(task, 1000 + seed, meant) for seed in range(CHOSEN_ON)]
     print(f"{'':16}" + "".join(f"{n:>16}" for n in EPOCHS))
     for precision in ("int8", "float"):
         settings = [Settings("sgm", precision, layers, epochs=n) for n in EPOCHS]
@@ -45,9 +45,9 @@ def main(folder, layers=None):
     tell("untouched", [accuracies(task, bundle, devices, Settings(layers=layers, epochs=0))])
 
 
-def device(task, seed):
+def device(task, seed, own_meanings):
     """What one device is shown, and what it is asked: one hand, one meaning of digits."""
-    both = task.met(np.random.default_rng([7, seed]), SHOWN + ASKED)
+    both = task.met(np.random.default_rng([7, seed]), SHOWN + ASKED, own_meanings)
     halves = slice(SHOWN), slice(SHOWN, None)
     return [Samples(both.inputs[half], both.labels[half]) for half in halves]
 
@@ -71,4 +71,4 @@ def tell(name, columns):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(int, sys.argv[2:]))
+    main(*sys.argv[1:])

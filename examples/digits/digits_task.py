@@ -32,9 +32,10 @@ class Digits(ArraysTask):  # which reads `samples` and `labels` of an .npz
     def draw(self, rng, count):
         return written(*pool()[:2], rng, count, meanings(rng))
 
-    def met(self, rng, count):
+    def met(self, rng, count, own_meanings=True):
         """As :meth:`draw`, of digits that only devices meet."""
-        return written(*pool()[2:], rng, count, meanings(rng))
+        meaning = meanings(rng) if own_meanings else np.arange(CLASSES)
+        return written(*pool()[2:], rng, count, meaning)
 
     def example(self, rng, count):
         return written(*pool()[:2], rng, count, np.arange(CLASSES))

@@ -10,7 +10,7 @@ import numpy as np
 
 from qsgm import load_task
 
-SHOWN, ASKED = 200, 8
+SHOWN, ASKED = 200, 100
 
 seed = int(sys.argv[1]) if len(sys.argv) > 1 else 0
 task = load_task(Path(__file__).with_name("digits_task.py"))

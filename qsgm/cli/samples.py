@@ -1,7 +1,7 @@
 """What the commands do for networks of one's own; see :mod:`qsgm.samples`."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -90,7 +90,12 @@ def show_learnt(result: "SamplesResult", folder: Path, name: str, as_json: bool)
 
 
 def predict_task(
-    folder: Path, file: Path | None, samples: Path, threads: int, as_json: bool
+    folder: Path,
+    file: Path | None,
+    samples: Path,
+    threads: int,
+    as_json: bool,
+    grasping: Mapping[str, bool],
 ) -> bool:
     """`qsgm predict` with a tuned network; False where the folder is grasping's."""
     from qsgm.samples.arrays import ArraysTask
@@ -102,6 +107,7 @@ def predict_task(
         if file is not None:
             raise QsgmError(f"{folder} is of the task 'grasp', which takes no --task")
         return False
+    refuse_options(**grasping)
     network = load_network(folder, threads)
     kept, given = network.task, _device_task(file)
     task: SampleTask = ArraysTask(kept.name, kept.network, kept.heads, tuned_of(kept))

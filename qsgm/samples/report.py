@@ -47,8 +47,8 @@ def learnt_report(result: Result, name: str) -> RenderableType:
     ]
     heading = f"{len(result.prepared.held_out)} held-out samples"
     columns: list[str | tuple[str, str]] = [heading, *((one, "{:.3f}") for one in names)]
-    scores = table(run_title(result, name), columns, rows)
-    return Group(scores, fidelity_report(result), seconds_line(result.seconds))
+    title, scores = Text(run_title(result, name), style="bold"), table(None, columns, rows)
+    return Group(title, scores, fidelity_report(result), seconds_line(result.seconds))
 
 
 def answers_json(

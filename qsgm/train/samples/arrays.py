@@ -7,6 +7,7 @@
 group: a person, a machine, a day; that is what a device meets.
 """
 
+import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,7 @@ class PooledArrays(ArraysTask):
     inputs: Inputs = field(default_factory=lambda: np.zeros(0, np.uint8), repr=False)
     labels: Array = field(default_factory=lambda: np.zeros(0, np.float32), repr=False)
     groups: tuple[NDArray[np.int64], ...] = field(default=(), repr=False)  # rows of each
+    sha256: str = ""  # of the pool: an unfinished pretraining goes on with the same only
 
     def draw(self, rng: np.random.Generator, count: int) -> Samples:
         among = self.groups[rng.integers(len(self.groups))]
@@ -64,7 +66,8 @@ def load_arrays_task(path: Path) -> PooledArrays:
     if found.labels is None:
         raise QsgmError(f"{pool} holds no `{LABELS}`, without which nothing can be learnt")
     groups = _rows_of(arrays.get(GROUPS), len(found), pool)
-    return PooledArrays(NAME, network, heads, tuned, found.inputs, found.labels, groups)
+    digest = hashlib.sha256(found.inputs.tobytes() + found.labels.tobytes()).hexdigest()
+    return PooledArrays(NAME, network, heads, tuned, found.inputs, found.labels, groups, digest)
 
 
 def _rows_of(groups: NDArray[Any] | None, count: int, pool: Path) -> tuple[NDArray[np.int64], ...]:
