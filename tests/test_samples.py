@@ -14,7 +14,7 @@ import pytest
 from qsgm import Head, Network, QsgmError, Samples, SampleTask, conv, load_task
 from qsgm.samples.arrays import NAME, ArraysTask, read_npz
 from qsgm.samples.lesson import head_scores, lesson_of
-from qsgm.samples.taskfile import task_for
+from qsgm.samples.taskfile import read_samples, task_for
 from qsgm.task import TaskRecord, task_record
 
 NETWORK = Network((2, 3, 1), (conv(1, 4, (2, 3)), conv(4, 3, relu=False)), "numbers")
@@ -179,6 +179,21 @@ def test_a_task_file_that_is_none_is_refused_in_one_line(
     if source is not None:
         path.write_text(source)
     assert said in refused(lambda: load_task(path))
+
+
+def test_what_a_task_file_raises_while_it_reads_is_one_line() -> None:
+    class Wrong(SampleTask):
+        def read(self, path: Path) -> Samples:
+            raise KeyError(f"{path}\nand more")
+
+    class Empty(SampleTask):
+        def read(self, path: Path) -> Any:  # noqa: ARG002
+            return None
+
+    message = refused(lambda: read_samples(Wrong("mine", NETWORK, HEADS), Path("a.npz")))
+    assert "the task 'mine' cannot read a.npz: KeyError in line" in message
+    message = refused(lambda: read_samples(Empty("mine", NETWORK, HEADS), Path("a.npz")))
+    assert "a.npz gives a NoneType, expected qsgm.Samples" in message
 
 
 def test_another_tasks_file_is_refused_and_so_is_none() -> None:

@@ -72,12 +72,12 @@ def learn_task(
     usual_layers: bool,
 ) -> "SamplesResult":
     """`qsgm finetune` with a bundle of samples."""
-    from qsgm.samples.taskfile import task_of_bundle
+    from qsgm.samples.taskfile import read_samples, task_of_bundle
     from qsgm.samples.teach import learn, usual_settings
 
     task = task_of_bundle(bundle, _device_task(file))
     settings = usual_settings(bundle, task, settings) if usual_layers else settings
-    samples = [task.read(path) for path in shown]
+    samples = [read_samples(task, path) for path in shown]
     with progress() as watch:
         return learn(samples, bundle, task, settings, watch)
 
@@ -100,7 +100,7 @@ def predict_task(
     """`qsgm predict` with a tuned network; False where the folder is grasping's."""
     from qsgm.samples.arrays import ArraysTask
     from qsgm.samples.report import answers_json, answers_table
-    from qsgm.samples.taskfile import task_for, tuned_of
+    from qsgm.samples.taskfile import read_samples, task_for, tuned_of
     from qsgm.samples.tuned import load_network, task_named_in
 
     if task_named_in(folder) is None:
@@ -113,7 +113,7 @@ def predict_task(
     task: SampleTask = ArraysTask(kept.name, kept.network, kept.heads, tuned_of(kept))
     if given is not None:
         task = task_for(kept, f"the tuned network {folder}", given)
-    seen = task.read(samples)
+    seen = read_samples(task, samples)
     outputs = network.answers(seen.inputs)
     scores = None if seen.labels is None else task.scores(outputs, seen.labels)
     values = answers_json(network.name, kept.name, kept.heads, outputs, scores)

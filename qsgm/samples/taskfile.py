@@ -13,6 +13,7 @@ from qsgm.files import read_file
 from qsgm.network import Network
 from qsgm.samples.arrays import NAME as ARRAYS
 from qsgm.samples.arrays import ArraysTask
+from qsgm.samples.lesson import Samples, checked_samples
 from qsgm.samples.task import TUNED, SampleTask
 from qsgm.task import Described
 
@@ -78,6 +79,21 @@ def task_for(kept: Described, where: str, task: SampleTask | None) -> SampleTask
 def task_of_bundle(bundle: Bundle, task: SampleTask | None) -> SampleTask:
     """The task of a bundle, see :func:`task_for`."""
     return task_for(bundle.manifest.task, f"the bundle {bundle.folder}", task)
+
+
+def read_samples(task: SampleTask, path: Path) -> Samples:
+    """What a task reads in a file, checked.
+
+    Raises:
+        QsgmError: the file cannot be read, or holds what does not fit the task.
+    """
+    try:
+        found = task.read(path)
+    except QsgmError:
+        raise
+    except Exception as error:  # whatever somebody's code raises
+        raise QsgmError(f"the task {task.name!r} cannot read {path}: {_told(error)}") from error
+    return checked_samples(found, task.network, task.heads, str(path))
 
 
 def tuned_of(kept: Described) -> int:
