@@ -279,13 +279,12 @@ def predict(
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
-    folder = paths.last_object_folder() if tuned is None else tuned
-    grasping = {"all": everything, "any_distance": any_distance, "output": output is not None}
-    if predict_task(folder, task, scene, threads, as_json, grasping):
-        return
     if output is not None:
         check_png_name(output)
         check_output(output, scene)
+    grasping = {"all": everything, "any_distance": any_distance, "output": output is not None}
+    if predict_task(tuned or (), task, scene, threads, as_json, grasping):
+        return
     objects = load_objects(tuned or (), threads)
     frame = read_frame(scene)
     sights = [

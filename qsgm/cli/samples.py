@@ -90,29 +90,32 @@ def show_learnt(result: "SamplesResult", folder: Path, name: str, as_json: bool)
 
 
 def predict_task(
-    folder: Path,
+    given: Sequence[Path],
     file: Path | None,
     samples: Path,
     threads: int,
     as_json: bool,
     grasping: Mapping[str, bool],
 ) -> bool:
-    """`qsgm predict` with a tuned network; False where the folder is grasping's."""
+    """`qsgm predict` with a tuned network; False where what is given is grasping's."""
+    from qsgm import paths
+    from qsgm.grasp.store import find_object
     from qsgm.samples.arrays import ArraysTask
     from qsgm.samples.report import answers_json, answers_table
     from qsgm.samples.taskfile import read_samples, task_for, tuned_of
     from qsgm.samples.tuned import load_network, task_named_in
 
-    if task_named_in(folder) is None:
+    folder = find_object(given[0]) if given else paths.last_object_folder()
+    if len(given) > 1 or task_named_in(folder) is None:
         if file is not None:
-            raise QsgmError(f"{folder} is of the task 'grasp', which takes no --task")
+            raise QsgmError("--task goes with one tuned network, not with objects to be found")
         return False
     refuse_options(**grasping)
     network = load_network(folder, threads)
-    kept, given = network.task, _device_task(file)
+    kept, own = network.task, _device_task(file)
     task: SampleTask = ArraysTask(kept.name, kept.network, kept.heads, tuned_of(kept))
-    if given is not None:
-        task = task_for(kept, f"the tuned network {folder}", given)
+    if own is not None:
+        task = task_for(kept, f"the tuned network {folder}", own)
     seen = read_samples(task, samples)
     outputs = network.answers(seen.inputs)
     scores = None if seen.labels is None else task.scores(outputs, seen.labels)
