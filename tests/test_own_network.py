@@ -112,6 +112,20 @@ def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
     assert "--output concerns" in refused(capsys, "predict", "-o", tmp_path / "a.png", path)
     assert cli.run(["predict", str(path)]) == 0  # the last one tuned
     assert "digit_accuracy" in capsys.readouterr().out
+    two = ["predict", "--object", tuned, "--object", tuned, path]
+    assert "answers alone" in refused(capsys, *two)
+
+
+def test_among_objects_a_tuned_network_is_said_to_be_no_object(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = samples(tmp_path / "hand.npz")
+    printed(capsys, "finetune", "--bundle", made / "mine", "--task", FILE, path)
+    (listed,) = printed(capsys, "objects", "list")["objects"]
+    assert (listed["name"], listed["last"]) == ("hand", True)
+    assert "tuned network of another task" in listed["problem"]
+    assert printed(capsys, "predict", "--object", "hand", path)["object"] == "hand"
+    assert printed(capsys, "objects", "remove", "hand", "--yes")["removed"] == listed["folder"]
 
 
 def test_without_its_task_a_bundle_is_refused_in_one_line(

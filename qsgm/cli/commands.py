@@ -274,18 +274,19 @@ def predict(
     with its name and whether it was `found`. With one, `objects` is what --all found of it.
     """
     from qsgm.grasp.sights import look_for, sights_json, sights_picture, sights_table
-    from qsgm.grasp.store import load_objects
+    from qsgm.grasp.store import find_objects, load_objects
     from qsgm.images import check_png_name, read_frame, write_png
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
+    folders = find_objects(tuned or ())
+    grasping = {"all": everything, "any_distance": any_distance, "output": output is not None}
+    if predict_task(folders, task, scene, threads, as_json, grasping):
+        return
     if output is not None:
         check_png_name(output)
         check_output(output, scene)
-    grasping = {"all": everything, "any_distance": any_distance, "output": output is not None}
-    if predict_task(tuned or (), task, scene, threads, as_json, grasping):
-        return
-    objects = load_objects(tuned or (), threads)
+    objects = load_objects(folders, threads)
     frame = read_frame(scene)
     sights = [
         look_for(one, frame, everything=everything, any_distance=any_distance) for one in objects

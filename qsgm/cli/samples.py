@@ -90,32 +90,33 @@ def show_learnt(result: "SamplesResult", folder: Path, name: str, as_json: bool)
 
 
 def predict_task(
-    given: Sequence[Path],
+    folders: Sequence[Path],
     file: Path | None,
     samples: Path,
     threads: int,
     as_json: bool,
     grasping: Mapping[str, bool],
 ) -> bool:
-    """`qsgm predict` with a tuned network; False where what is given is grasping's."""
-    from qsgm import paths
-    from qsgm.grasp.store import find_object
+    """`qsgm predict` with a tuned network; False where the folders are grasping's."""
     from qsgm.samples.arrays import ArraysTask
     from qsgm.samples.report import answers_json, answers_table
     from qsgm.samples.taskfile import read_samples, task_for, tuned_of
     from qsgm.samples.tuned import load_network, task_named_in
 
-    folder = find_object(given[0]) if given else paths.last_object_folder()
-    if len(given) > 1 or task_named_in(folder) is None:
+    others = [one for one in folders if task_named_in(one) is not None]
+    if not others:
         if file is not None:
-            raise QsgmError("--task goes with one tuned network, not with objects to be found")
+            raise QsgmError(f"{folders[0]} is of the task 'grasp', which takes no --task")
         return False
+    folder = others[0]
+    if len(folders) > 1:
+        raise QsgmError(f"{folder} is a tuned network, which answers alone; pass one --object")
     refuse_options(**grasping)
     network = load_network(folder, threads)
-    kept, own = network.task, _device_task(file)
+    kept, given = network.task, _device_task(file)
     task: SampleTask = ArraysTask(kept.name, kept.network, kept.heads, tuned_of(kept))
-    if own is not None:
-        task = task_for(kept, f"the tuned network {folder}", own)
+    if given is not None:
+        task = task_for(kept, f"the tuned network {folder}", given)
     seen = read_samples(task, samples)
     outputs = network.answers(seen.inputs)
     scores = None if seen.labels is None else task.scores(outputs, seen.labels)

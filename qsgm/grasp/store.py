@@ -130,14 +130,22 @@ def find_object(given: Path, *, names_first: bool = False) -> Path:
     )
 
 
+def find_objects(given: Sequence[Path]) -> list[Path]:
+    """The folders of the objects asked for, see :func:`find_object`, or the last one's.
+
+    Raises:
+        QsgmError: one is not there, or none was asked for and none tuned.
+    """
+    return [find_object(one) for one in given] or [paths.last_object_folder()]
+
+
 def load_objects(given: Sequence[Path], threads: int = 1) -> list[TunedObject]:
-    """The objects asked for, by folder or name, or the last one.
+    """The objects asked for, see :func:`find_objects`.
 
     Raises:
         QsgmError: one cannot be used, or two have one name.
     """
-    folders = [find_object(one) for one in given] or [paths.last_object_folder()]
-    objects = [load_object(folder, threads) for folder in folders]
+    objects = [load_object(folder, threads) for folder in find_objects(given)]
     names = [one.description.name for one in objects]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

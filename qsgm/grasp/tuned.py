@@ -317,6 +317,11 @@ def _read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
     path = folder / DESCRIPTION
     data = read_file(path, MANIFEST_BYTES, f"an object written by `{_COMMAND}`")
     manifest = parse_description(data, path, FORMAT, VERSIONS, _COMMAND)
+    if "task" in manifest:
+        raise QsgmError(
+            f"{folder} is a tuned network of another task, no object to look for in a frame; pass "
+            "`qsgm predict` its samples instead"
+        )
     first = manifest["version"] == VERSIONS[0]
     require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
     name, encoding, offset_rad = (manifest[key] for key in ("name", "encoding", "offset_rad"))
