@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,10 @@ torch.set_num_threads(1)
 # The same examples every time, however busy the machine is, and nothing kept between runs.
 settings.register_profile("qsgm", deadline=None, derandomize=True, database=None)
 settings.load_profile("qsgm")
+
+# As a shell starts what it puts into the background, tests of interrupts would fail.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MOST_LAYERS = 6
 RATES = (1e-4, 1e-4, 1e-3, 0.002, 0.005, 0.02)

@@ -44,7 +44,7 @@ from qsgm.bench.subjects import drawn_subjects, subjects_of
 from qsgm.cli.bench import SceneCondition
 from qsgm.tune.settings import Settings
 
-RIVALS = Path(__file__).parent.parent / "benchmarks" / "rivals"
+RIVALS = Path(__file__).parents[2] / "benchmarks" / "rivals"
 NOTHING = np.zeros((480, 640), bool)
 HERE = (200.0, 200.0)
 
@@ -371,7 +371,9 @@ def test_rivals_find_an_object_where_it_is(tmp_path: Path, name: str) -> None:
 
 
 def test_rivals_import_nothing_of_qsgm() -> None:
-    for path in RIVALS.glob("*.py"):
+    paths = [*RIVALS.glob("*.py")]
+    assert paths
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

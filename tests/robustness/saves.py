@@ -296,8 +296,6 @@ def main() -> None:
     name, folder, old, new, seed, rounds = sys.argv[1:]
     networks = {"old": Path(old).read_bytes(), "new": Path(new).read_bytes()}
     campaign = globals()[name]
-    # A process that a shell put into the background is told to overlook interrupts.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     file_events.watch()
     counts = campaign(Path(folder), networks, int(seed), int(rounds))
     sys.stdout.write(f"{json.dumps(counts)}\n")
