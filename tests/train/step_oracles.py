@@ -29,6 +29,7 @@ from qsgm.train.graphs.optimizers import Adam, Optimizer, Sgd
 from qsgm.train.graphs.step import AnySgm, step_model
 from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.fold import fold_sgm, run_folded_conv, run_folded_sgm
+from qsgm.train.model.net import Convolution
 from qsgm.train.model.sgm import Sgm
 from qsgm.weights import to_step_layout
 
@@ -151,7 +152,7 @@ class Reference:
         for number in layers:
             folded, layer = net.layers[number - 1], net.network.layer(number)
             out_channels, in_channels, *kernel = folded.weight.shape
-            conv = nn.Conv2d(in_channels, out_channels, kernel, layer.stride, layer.padding)
+            conv = Convolution(in_channels, out_channels, kernel, layer.stride, layer.padding)
             conv.weight.data = torch.tensor(folded.weight, dtype=dtype)
             conv.bias.data = torch.tensor(folded.bias, dtype=dtype)
             self.convs[number] = conv

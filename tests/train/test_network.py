@@ -1,5 +1,8 @@
 """Exported trunk, head and network against torch and against each other."""
 
+import subprocess
+import sys
+
 import numpy as np
 import onnx
 import onnxruntime as ort
@@ -7,6 +10,7 @@ import pytest
 import torch
 from losses import GraspLoss
 from nets import random_net
+from torch import nn
 
 from qsgm import QsgmError
 from qsgm.grasp.angles import AngleEncoding
@@ -15,7 +19,7 @@ from qsgm.train.graphs.probe import head_model
 from qsgm.train.graphs.trunk import initializer_offsets, network_model, trunk_model
 from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.fold import fold_net
-from qsgm.train.model.net import ConvNet, as_seen
+from qsgm.train.model.net import ConvNet, Convolution, as_seen
 from qsgm.weights import to_conv_layout, to_step_layout
 
 HEADS = GraspLoss().heads
@@ -154,3 +158,35 @@ def test_initializers_outside_raw_data_are_refused(net: ConvNet) -> None:
     tensor.float_data.extend([1.0, 2.0, 3.0])
     with pytest.raises(QsgmError, match="'bias6' cannot be located"):
         initializer_offsets(model.SerializeToString())
+
+
+STRIDED = """
+import torch
+from qsgm.train.model.net import Convolution
+for stride in ((1, 2), (1, 3), (2, 1), (2, 2)):
+    own = Convolution(3, 1, 1, stride)
+    x = torch.randn(8, 3, 2, 12).contiguous(memory_format=torch.channels_last)
+    for _ in range(200):
+        own(x).square().sum().backward()
+"""
+
+
+def test_windows_of_one_position_learn_without_spoiling_memory() -> None:
+    """In a process of its own, which would be killed."""
+    assert subprocess.run([sys.executable, "-c", STRIDED], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("stride", [(1, 1), (1, 3), (2, 1), (2, 3)])
+@pytest.mark.parametrize("padding", [(0, 0), (0, 1)])
+def test_a_convolution_is_torchs(stride: tuple[int, int], padding: tuple[int, int]) -> None:
+    own = Convolution(3, 4, 1, stride, padding).double()
+    x = torch.randn(2, 3, 5, 7, dtype=torch.float64, requires_grad=True)
+    expected = nn.functional.conv2d(x, own.weight, own.bias, stride, padding)
+    found = own(x)
+    torch.testing.assert_close(found, expected)
+    for got, wanted in zip(
+        torch.autograd.grad(found.square().sum(), [x, own.weight]),
+        torch.autograd.grad(expected.square().sum(), [x, own.weight]),
+        strict=True,
+    ):
+        torch.testing.assert_close(got, wanted)

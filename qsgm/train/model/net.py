@@ -7,12 +7,27 @@ from qsgm.network import ONE, Layer, Network
 from qsgm.train.model.arrays import PIXEL_RANGE
 
 
+class Convolution(nn.Conv2d):
+    """A convolution whose windows of a single position are taken out of its input before.
+
+    Left to torch 2.13, whose oneDNN steps through the input itself, the way back writes beyond its
+    memory where such windows leave out columns and no rows, channels lie last and numbers are
+    float32.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 torch's name
+        if self.kernel_size != ONE or self.padding != (0, 0):
+            return super().forward(input)
+        down, right = self.stride
+        return F.conv2d(input[:, :, ::down, ::right], self.weight, self.bias)
+
+
 class ConvLayer(nn.Module):
     """Convolution, then batchnorm and ReLU, then average pool, where the layer has them."""
 
     def __init__(self, layer: Layer) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(
+        self.conv = Convolution(
             layer.into, layer.out, layer.kernel, layer.stride, padding=layer.padding
         )
         self.norm = nn.BatchNorm2d(layer.out) if layer.relu else None
