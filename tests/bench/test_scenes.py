@@ -95,12 +95,11 @@ def test_the_centre_is_that_of_the_rectangle_around_the_object(kind: str) -> Non
 
 def test_a_view_scales_and_squeezes_along_its_direction() -> None:
     drawn = an_object(0, "pen")
-    level = np.argwhere(scene(0, drawn).mask)
     along = np.argwhere(scene(0, drawn, view=View(1.25, np.deg2rad(25), 0.0)).mask)
     across = np.argwhere(scene(0, drawn, view=View(0.8, np.deg2rad(25), np.pi / 2)).mask)
-    length = np.ptp(level[:, 1])
-    assert np.ptp(along[:, 1]) == pytest.approx(1.25 * np.cos(np.deg2rad(25)) * length, abs=1.5)
-    assert np.ptp(across[:, 1]) == pytest.approx(0.8 * length, abs=1.5)
+    length, tilted = drawn.size_px[0], np.cos(np.deg2rad(25))
+    assert np.ptp(along[:, 1]) + 1 == pytest.approx(1.25 * tilted * length, abs=1.5)
+    assert np.ptp(across[:, 1]) + 1 == pytest.approx(0.8 * length, abs=1.5)
 
 
 @pytest.mark.parametrize("turn", [-2.5, -0.4, 0.0, 1.1, 3.0])

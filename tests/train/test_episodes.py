@@ -50,7 +50,7 @@ def made_up_scenes() -> list[JudgedScene]:
     for number in range(300):
         center = (100.0, 100.0) if number % 2 else None
         facts = rng.normal(size=(2, len(NAMES))).astype(np.float32)
-        facts[0, 0] += 5.0 * (center is not None)
+        facts[0, 0] += 8.0 * (center is not None)
         places = ((100.0, 103.0), (300.0, 200.0))
         found = tuple(
             SimpleNamespace(evidence=fact, center_px=place)
