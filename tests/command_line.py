@@ -8,6 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+# Of every layer with an SGM.
+FIDELITY_KEYS = {
+    "cos_int8_float",
+    "cos_int8_true",
+    "cos_float_true",
+    "norm_ratio_int8_true",
+    "sign_agreement_int8_float",
+    "clipped_fraction",
+}
+
 
 @dataclass(frozen=True)
 class Outcome:

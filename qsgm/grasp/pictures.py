@@ -7,6 +7,7 @@ size; lengths that belong to the drawing are in units of 1/1280 of the canvas wi
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -132,14 +133,18 @@ def draw_objects(
 
 
 def _label(canvas: _Canvas, text: str, at: Point, color: Color) -> None:
-    """Text with a dark rim, inside of the canvas."""
+    """Text with a dark rim, inside of the canvas.
+
+    The rim is the text itself, moved: a heavier one is wider, and would lie beside it.
+    """
     size, (height, width) = canvas.unit * 0.8, canvas.image.shape[:2]
-    shown = _shortened(as_text(text), width - 16 * canvas.unit, size)
-    x = min(max(at[0], 8 * canvas.unit), width - 8 * canvas.unit - _text_width(shown, size))
-    where = (round(x), round(min(max(at[1], 32 * canvas.unit), height - 8)))
-    for paint, more in ((_OUTLINE, canvas.thick(3)), (color, 0)):
-        weight = _weight(size, bold=True) + more
-        cv2.putText(canvas.image, shown, where, _FONT, size, paint, weight, cv2.LINE_AA)
+    shown = _shortened(as_text(text), width - 16 * canvas.unit, size, bold=True)
+    x = min(max(at[0], 8 * canvas.unit), width - 8 * canvas.unit - _text_width(shown, size, True))
+    y = min(max(at[1], 32 * canvas.unit), height - 8)
+    rim = max(1, canvas.thick(3) // 2)
+    for right, down in product((-rim, 0, rim), repeat=2):
+        _text(canvas.image, shown, (x + right, y + down), size, _OUTLINE, bold=True)
+    _text(canvas.image, shown, (x, y), size, color, bold=True)
 
 
 def _enlarge(frame: Picture, reach: float, *, dim: bool) -> _Canvas:
@@ -342,10 +347,10 @@ def _weight(scale: float, bold: bool) -> int:
     return max(1, round(scale * (2.4 if bold else 1.4)))
 
 
-def _shortened(text: str, room: float, scale: float) -> str:
+def _shortened(text: str, room: float, scale: float, bold: bool = False) -> str:
     """As much of a text as fits."""
-    if _text_width(text, scale) <= room:
+    if _text_width(text, scale, bold) <= room:
         return text
-    while text and _text_width(text + "...", scale) > room:
+    while text and _text_width(text + "...", scale, bold) > room:
         text = text[:-1]
     return text + "..."

@@ -3,16 +3,7 @@
 import json
 from pathlib import Path
 
-from command_line import Run, assert_refused
-
-FIDELITY_KEYS = {
-    "cos_int8_float",
-    "cos_int8_true",
-    "cos_float_true",
-    "norm_ratio_int8_true",
-    "sign_agreement_int8_float",
-    "clipped_fraction",
-}
+from command_line import FIDELITY_KEYS, Run, assert_refused
 
 
 def test_fidelity_prints_the_table_and_keeps_nothing(

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import Run, assert_refused
+from command_line import FIDELITY_KEYS, Run, assert_refused
 
 from qsgm import paths
 from qsgm.cli import commands
@@ -32,14 +32,6 @@ FINETUNE_KEYS = {
     "seconds",
     "peak_activation_bytes",
     "stream",
-}
-FIDELITY_KEYS = {
-    "cos_int8_float",
-    "cos_int8_true",
-    "cos_float_true",
-    "norm_ratio_int8_true",
-    "sign_agreement_int8_float",
-    "clipped_fraction",
 }
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from qsgm.grasp.heatmap import Detection
-from qsgm.grasp.pictures import _values, draw_detection
+from qsgm.grasp.pictures import _values, draw_detection, draw_objects
 
 FRAME = np.full((480, 640, 3), 128, dtype=np.uint8)
 NOTHING = np.zeros((3, 23, 33), dtype=np.float32)
@@ -120,3 +120,14 @@ def test_the_verdict_has_its_own_colour() -> None:
     found, missing = drawn()[1000, 2].astype(int), drawn(found=False)[1000, 2].astype(int)
     assert found[1] > found[2]
     assert missing[2] > missing[1]
+
+
+@pytest.mark.parametrize("enlarged", [True, False])
+def test_a_names_dark_rim_lies_around_its_letters(enlarged: bool) -> None:
+    absent = [("a name of some length", detection(found=False))]
+    picture = draw_objects(FRAME, absent, enlarged=enlarged).astype(int)
+    ink = (picture.max(axis=2) - picture.min(axis=2) > 60).any(axis=0).nonzero()[0]
+    changed = (np.abs(picture - 128).max(axis=2) > 8).any(axis=0).nonzero()[0]
+    assert len(ink) > 100
+    assert 0 <= ink[0] - changed[0] <= 6
+    assert 0 <= changed[-1] - ink[-1] <= 6
