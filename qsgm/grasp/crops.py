@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from qsgm.errors import QsgmError
 from qsgm.grasp.angles import AngleEncoding, encode_angle
 from qsgm.grasp.network import CROP_PX
+from qsgm.grasp.pixels import MIRRORED, arithmetic
 
 HALF_CROP_PX = CROP_PX // 2
 TRAIN_CROPS = 800
@@ -112,8 +113,9 @@ def widened(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def cut_widened(wide: NDArray[np.uint8], plan: CropPlan) -> NDArray[np.uint8]:
     """:func:`cut_crops` of a frame (H, W, 4) that is :func:`widened` already."""
     crops = np.empty((len(plan), CROP_PX, CROP_PX, 3), dtype=np.uint8)
+    recolor = arithmetic().recolor
     for crop, window, color in zip(crops, windows_of(wide, plan), plan.color, strict=True):
-        cv2.transform(window, color, crop)
+        recolor(window, color, crop)
     return crops
 
 
@@ -124,10 +126,9 @@ def windows_of(wide: NDArray[np.uint8], plan: CropPlan) -> Iterator[NDArray[np.u
     """
     # Used for every crop: allocating them anew takes longer than converting.
     cut, narrow = (np.empty((CROP_PX, CROP_PX, channels), np.uint8) for channels in (4, 3))
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    border = cv2.BORDER_REFLECT_101
+    warp = arithmetic().warp
     for window in _windows(plan):
-        cv2.warpAffine(wide, window, (CROP_PX, CROP_PX), cut, flags, border)
+        warp(wide, window, MIRRORED, cut)
         cv2.cvtColor(cut, cv2.COLOR_BGRA2BGR, narrow)
         yield narrow
 

@@ -7,8 +7,7 @@ and grain.
 
 Everything random is drawn first, as a :class:`PastePlan` or an :class:`EdgePlan`. What is then done
 to a crop is integer arithmetic on bytes, written down here so that other languages can repeat it,
-behind one bilinear mapping (as crops have it). `x / 255` stands for `(x + 127) // 255` throughout,
-which ``cv2.multiply(a, b, scale=1/255)`` computes for all bytes a and b.
+behind one bilinear mapping (as crops have it). `x / 255` stands for `(x + 127) // 255` throughout.
 """
 
 import math
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from qsgm.errors import QsgmError
 from qsgm.grasp.crops import HALF_CROP_PX
 from qsgm.grasp.network import CROP_PX
+from qsgm.grasp.pixels import ZERO, arithmetic
 
 FILE = "distractors.png"
 TILE_PX = 128
@@ -218,12 +218,13 @@ def paste(
     if box[0] >= box[2] or box[1] >= box[3]:
         return
     middle = (TILE_PX - 1) / 2
-    shift_x = x - box[0] - (cos + sin) * middle
-    shift_y = y - box[1] - (cos - sin) * middle
-    matrix = np.array([[cos, sin, shift_x], [-sin, cos, shift_y]])  # rows count downwards
+    cos, sin, x, y = math.cos(turn_rad) / scale, math.sin(turn_rad) / scale, x - box[0], y - box[1]
+    motion = np.array(
+        [[cos, -sin, middle - cos * x + sin * y], [sin, cos, middle - sin * x - cos * y]]
+    )
     lit = sprite if gain is None else _gained(sprite, reach_px, gain)
-    size = (box[2] - box[0], box[3] - box[1])
-    layer = np.asarray(cv2.warpAffine(lit, matrix, size, flags=cv2.INTER_LINEAR), np.uint8)
+    layer = np.empty((box[3] - box[1], box[2] - box[0], 4), np.uint8)
+    arithmetic().warp(lit, motion, ZERO, layer)
     _blend(crop, layer, box, shadow)
 
 
@@ -279,14 +280,15 @@ def paint_edge(
         grain: (128, 128) or larger, of which the first are used.
         strength: of the grain, 0 to 255.
     """
-    share = cv2.cvtColor(_inside(planes), cv2.COLOR_GRAY2BGR)
+    share = np.repeat(_inside(planes)[..., None], 3, axis=2)
     bumps = (_LEVELS - 128) * strength >> 7
     levels = np.clip(color[:, None] + bumps, 0, 255).astype(np.uint8)
     window = grain[:CROP_PX, :CROP_PX]
-    surface = cv2.merge([cv2.LUT(window, level) for level in levels])
-    covered = cv2.multiply(surface, share, scale=1 / 255)
-    cv2.multiply(crop, cv2.bitwise_not(share), crop, scale=1 / 255)
-    cv2.add(crop, covered, crop)
+    surface = np.asarray(cv2.merge([cv2.LUT(window, level) for level in levels]), np.uint8)
+    product = arithmetic().product
+    product(surface, share, surface)
+    product(crop, ~share, crop)
+    cv2.add(crop, surface, crop)
 
 
 def _sheet_size(data: bytes) -> tuple[int, int]:
@@ -384,15 +386,15 @@ def _gained(sprite: Layer, reach_px: NDArray[np.int32], gain: NDArray[np.int32])
 def _blend(crop: Crop, layer: Layer, box: Box, shadow: Shadow | None) -> None:
     """Lay a layer (h, w, 4) and its shadow on a box of the crop."""
     opacity = np.asarray(cv2.extractChannel(layer, 3), np.uint8)
-    seen: Layer = cv2.bitwise_not(opacity)  # type: ignore[assignment]
+    seen = ~opacity
     whole = box
     if shadow is not None and shadow.strength > 0:
         light, whole = _shadowed(opacity, box, shadow)
         under = _of(light, box, whole)
-        cv2.multiply(under, seen, under, scale=1 / 255)
+        arithmetic().product(under, seen, under)
         seen = light
     view = _of(crop, whole)
-    cv2.multiply(view, cv2.cvtColor(seen, cv2.COLOR_GRAY2BGR), view, scale=1 / 255)
+    arithmetic().product(view, np.repeat(seen[..., None], 3, axis=2), view)
     view = _of(crop, box)
     cv2.add(view, cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), view)
 
@@ -415,8 +417,8 @@ def _shadowed(opacity: Layer, box: Box, shadow: Shadow) -> tuple[Layer, Box]:
     )
     light = np.zeros((whole[3] - whole[1], whole[2] - whole[0]), np.uint8)
     _of(light, box, whole)[:] = opacity
-    side = 2 * radius + 1
-    soft = cv2.blur(light, (side, side), borderType=cv2.BORDER_CONSTANT)
+    soft = np.empty_like(light)
+    arithmetic().box_mean(light, radius, soft)
     levels = 255 - (shadow.strength * _LEVELS + 127) // 255
     dimmed = cv2.LUT(soft, levels.astype(np.uint8))
     return _moved(np.asarray(dimmed, np.uint8), x, y), whole

@@ -6,7 +6,6 @@ Kept are the frames, what was drawn at random, and the things to put on crops: n
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from qsgm.grasp.clutter import Addition, ClutterPlan, add_clutter, dimmed, joine
 from qsgm.grasp.crops import CROPS, CropPlan, plan_crops, widened, windows_of
 from qsgm.grasp.distractors import Distractors
 from qsgm.grasp.network import CROP_PX
+from qsgm.grasp.pixels import arithmetic
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,14 @@ class CropSource:
     def cut(self, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Cut the crops `rows`: (B, 128, 128, 3) BGR."""
         crops = np.empty((len(rows), CROP_PX, CROP_PX, 3), dtype=np.uint8)
+        recolor = arithmetic().recolor
         for number, wide in enumerate(self.wide):
             here = np.flatnonzero(self.shown[rows] == number)
             plan = self.plan[rows[here]]
             for at, window, color in zip(here, windows_of(wide, plan), plan.color, strict=True):
                 if self.clutter is not None and self.things is not None:
                     add_clutter(window, self.clutter, int(rows[at]), self.things)
-                cv2.transform(window, color, crops[at])
+                recolor(window, color, crops[at])
         return crops
 
 
