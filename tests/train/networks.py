@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +17,18 @@ from qsgm.task import Head, Heads
 from qsgm.train.model.arrays import FoldedLayer, FoldedNet
 
 LARGEST = 9  # side of an input
+# Any network of two to four layers, and shallow and deep ones along one axis and two.
+Shape = dict[str, Any]
+SHAPES: dict[str, Shape] = {
+    "2 to 4 layers": {},
+    "3 layers, 1-D": {"depth": 3, "rows": True},
+    "3 layers, 2-D": {"depth": 3, "rows": False},
+    "12 layers, 1-D": {"depth": 12, "rows": True},
+    "12 layers, 2-D": {"depth": 12, "rows": False},
+}
 # A network with a side beyond this may have blocks that go sample by sample.
 MANY = 24
+SHALLOW = 4  # layers; with more most have to leave maps their size
 
 
 @dataclass(frozen=True)
@@ -137,6 +148,14 @@ def layers(draw: st.DrawFn, side: Pair, into: int, *, first: bool) -> Layer:
 
 
 @st.composite
+def keeping(draw: st.DrawFn, side: Pair, into: int) -> Layer:
+    """A layer that leaves maps their size: were there none, a deep network would soon have 1x1."""
+    half = [min(draw(st.integers(0, 1)), (length - 1) // 2) for length in side]
+    kernel, padding = (2 * half[0] + 1, 2 * half[1] + 1), (half[0], half[1])
+    return Layer(into, draw(st.integers(2, 5)), kernel, padding=padding, relu=draw(st.booleans()))
+
+
+@st.composite
 def networks(
     draw: st.DrawFn,
     outputs: int,
@@ -144,17 +163,24 @@ def networks(
     *,
     relu: bool = False,
     padded_first: bool = True,
+    depth: int | None = None,
+    rows: bool | None = None,
 ) -> Network:
-    """Two to four layers on maps, rectangles or rows; the last sees all that is left.
+    """Layers on maps, rectangles or rows; the last sees all that is left.
 
-    With `relu` all layers but the last have one.
+    Two to four, or `depth`; with `rows` in one dimension, or not. With `relu` all layers but the
+    last have one.
     """
-    height = draw(st.sampled_from([1, *range(2, LARGEST + 1)]))
-    side: Pair = (height, draw(st.sampled_from([*range(2, LARGEST + 1), MANY])))
+    deep = depth is not None and depth > SHALLOW
+    heights = {True: [1], False: [*range(2, LARGEST + 1)], None: [1, *range(2, LARGEST + 1)]}
+    height = draw(st.sampled_from(heights[rows]))
+    side: Pair = (height, MANY if deep else draw(st.sampled_from([*range(2, LARGEST + 1), MANY])))
     shape = (*side, draw(st.integers(1, 3)))
     into, found = shape[2], []
-    for number in range(draw(st.integers(1, 3))):
-        layer = draw(layers(side, into, first=number == 0 and not padded_first))
+    for number in range(draw(st.integers(1, 3)) if depth is None else depth - 1):
+        first = number == 0 and not padded_first
+        keeps = deep and not first and draw(st.integers(0, 3)) > 0
+        layer = draw(keeping(side, into) if keeps else layers(side, into, first=first))
         if relu:
             layer = Layer(**{**vars(layer), "relu": True})
         found.append(layer)
@@ -173,11 +199,14 @@ def cases(
     *,
     relu: bool = False,
     padded_first: bool = True,
+    depth: int | None = None,
+    rows: bool | None = None,
 ) -> Case:
     """A network with weights of about the size that keeps activations at one."""
     some = draw(heads())
     outputs = sum(head.channels for head in some)
-    network = draw(networks(outputs, kinds, relu=relu, padded_first=padded_first))
+    shape = {"depth": depth, "rows": rows}
+    network = draw(networks(outputs, kinds, relu=relu, padded_first=padded_first, **shape))
     seed = draw(st.integers(0, 2**32 - 1))
     rng, folded = np.random.default_rng(seed), []
     for layer in network.layers:

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from string import ascii_lowercase
 from types import MappingProxyType
 
 import numpy as np
@@ -44,6 +45,7 @@ OPERATIONS = 8
 # Gates of one step that rounding may turn. Were there many, there would be nothing to compare.
 MOST_IN_DOUBT = 50
 RATES = {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.002, 5: 0.005, 6: 0.02}
+RATE = 0.003  # of layers that GraspNet has not
 # Input of the first tuned layer, by how many are tuned; of all six it is the pixels.
 POSITIONS = {1: 1, 2: 1, 3: 169, 4: 841, 5: 3844, 6: 16384}
 CHANNELS = {1: 16, 2: 16, 3: 16, 4: 8, 5: 8, 6: 3}
@@ -102,7 +104,7 @@ class Exported:
         self.results = [result.name for result in self.session.get_outputs()]
         self.feeds: Arrays = {}
         for wanted in self.session.get_inputs():
-            name, number = wanted.name, wanted.name[-1]
+            name, number = wanted.name, wanted.name.lstrip("_" + ascii_lowercase)
             if name in data:
                 self.feeds[name] = data[name]
             elif name == f"weight{number}":
@@ -110,7 +112,7 @@ class Exported:
             elif name == f"bias{number}":
                 self.feeds[name] = net.layers[int(number) - 1].bias
             elif name == f"rate{number}":
-                self.feeds[name] = np.array(RATES[int(number)], np.float32)
+                self.feeds[name] = np.array(rate_of(int(number)), np.float32)
             elif name != "rows":
                 self.feeds[name] = np.zeros(wanted.shape, np.float32)
 
@@ -232,7 +234,7 @@ class Reference:
 
 def rate_of(number: int) -> float:
     """A layer's rate as graphs are given it, in float32."""
-    return float(np.float32(RATES[number]))
+    return float(np.float32(RATES.get(number, RATE)))
 
 
 def as_rows(parameter: Tensor) -> np.ndarray:

@@ -1,17 +1,19 @@
 """Local updates, step graphs and trunks of any small network against torch and integer arithmetic.
 
-Two to four layers on rectangles or rows: padding, strides and pools of their own per direction,
-layers with and without ReLU, any heads.
+Two to four layers and twelve, on rectangles and rows: padding, strides and pools of their own per
+direction, layers with and without ReLU, any heads.
 """
 
 import numpy as np
 import onnxruntime as ort
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from losses import HeadsLoss
-from networks import Case, blocks_of, cases, plain_layer, plain_maps
+from networks import SHAPES, Case, Shape, blocks_of, cases, plain_layer, plain_maps
 from step_oracles import CROPS, Exported, compare_steps
+from test_fold import shake_norms
 from test_trunk import integer_trunk
 from torch import Tensor
 
@@ -28,12 +30,15 @@ from qsgm.train.graphs.trunk import int8_trunk_model, network_model, trunk_model
 from qsgm.train.heads import error
 from qsgm.train.model.arrays import FLAT_ARRAYS
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.fold import run_folded, run_folded_sgm
+from qsgm.train.model.fold import fold_net, folded_start, run_folded, run_folded_sgm
 from qsgm.train.model.local import LayerState, local_step, outputs, true_gradients
+from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.quantization.trunk import feature_steps, quantize_trunk
 from qsgm.train.quantization.trunk_ranges import observe_samples
 from qsgm.weights import to_step_layout
 
+EVERY_SHAPE = pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+EXAMPLES = 20  # of every shape
 TASKS, BATCH = 2, 3
 ROUNDING = 1e-12  # of the largest entry, in float64
 Weights = dict[int, tuple[Tensor, Tensor]]
@@ -89,8 +94,11 @@ def made_up(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
     return torch.sin(layer * activation) + labels[..., None, :1]
 
 
-@given(cases(), st.data())
-def test_a_local_step_and_true_gradients_are_autograds(case: Case, data: st.DataObject) -> None:
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.data())
+def test_a_local_step_and_true_gradients_are_autograds(shape: Shape, data: st.DataObject) -> None:
+    case = data.draw(cases(**shape))
     network, tuned = case.network, data.draw(st.integers(1, case.network.depth))
     tasks, (features, labels) = weights_of(case, tuned), data_of(case, tuned)
     states, loss = states_of(tasks), HeadsLoss(case.heads)
@@ -129,9 +137,13 @@ def test_a_local_step_and_true_gradients_are_autograds(case: Case, data: st.Data
             assert_equal(true[k][task], gradient.flatten(2).transpose(1, 2))
 
 
-@settings(max_examples=40)
-@given(cases(), st.sampled_from([Sgd(), Adam()]), st.data())
-def test_a_step_graph_steps_as_torch(case: Case, optimizer: Optimizer, data: st.DataObject) -> None:
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.sampled_from([Sgd(), Adam()]), st.data())
+def test_a_step_graph_steps_as_torch(
+    shape: Shape, optimizer: Optimizer, data: st.DataObject
+) -> None:
+    case = data.draw(cases(**shape))
     blocks = blocks_of(data.draw, case.network)
     arrays = {
         "features": case.features(blocks.layers[0], CROPS),
@@ -156,11 +168,13 @@ def quantized(case: Case, sgm: FoldedSgm, seen: np.ndarray) -> QuantizedSgm:
     return quantize_sgm(sgm, ranges)
 
 
-@settings(max_examples=40)
-@given(cases(), st.data())
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.data())
 def test_a_probe_tells_what_sgms_give_in_float_and_bit_for_bit_in_integers(
-    case: Case, data: st.DataObject
+    shape: Shape, data: st.DataObject
 ) -> None:
+    case = data.draw(cases(**shape))
     network = case.network
     tuned = data.draw(st.integers(2, network.depth))
     first = network.last(tuned)[0]
@@ -215,10 +229,13 @@ def run(model: object, **feeds: np.ndarray) -> np.ndarray:
     return session.run(None, feeds)[0]
 
 
-@given(cases(), st.data())
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.data())
 def test_trunk_head_and_network_are_the_folded_network_in_torch(
-    case: Case, data: st.DataObject
+    shape: Shape, data: st.DataObject
 ) -> None:
+    case = data.draw(cases(**shape))
     network, samples = case.network, case.samples(4)
     last = data.draw(st.integers(0, network.depth - 1))
     got = run(trunk_model(case.net, last), samples=samples)
@@ -239,10 +256,13 @@ def test_trunk_head_and_network_are_the_folded_network_in_torch(
     close(run_folded(case.net, torch.from_numpy(samples)).flatten(1).numpy(), raw.numpy())
 
 
-@given(cases(("pixels",), relu=True, padded_first=False), st.data())
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.data())
 def test_the_int8_trunk_is_integer_arithmetic_and_near_the_float_one(
-    case: Case, data: st.DataObject
+    shape: Shape, data: st.DataObject
 ) -> None:
+    case = data.draw(cases(("pixels",), relu=True, padded_first=False, **shape))
     network, samples = case.network, case.samples(6)
     ranges = dict(observe_samples(case.net, samples))
     net = type(case.net)(network, case.net.layers, feature_steps(ranges))
@@ -289,6 +309,24 @@ def test_curvature_bends_the_same_in_the_graph_and_in_torch(
         weight, bias = curvature.precondition(plain[0].T[None], plain[1][None])
         close(bent[0].numpy(), weight[0].T.numpy())
         close(bent[1].numpy(), bias[0].numpy())
+
+
+@EVERY_SHAPE
+@settings(max_examples=EXAMPLES)
+@given(st.data())
+def test_a_network_with_any_batchnorms_is_itself_folded(shape: Shape, data: st.DataObject) -> None:
+    case = data.draw(cases(**shape))
+    torch.manual_seed(case.seed % 2**31)
+    net = ConvNet(case.network)
+    shake_norms(net, case.seed)
+    net, folded, samples = net.double(), fold_net(net), torch.from_numpy(case.samples(3))
+    with torch.no_grad():
+        expected = net(as_seen(case.network, samples).double()).flatten(1)
+    close(run_folded(folded, samples).flatten(1).numpy(), expected.numpy())
+    start = folded_start(net.float(), case.network.depth)
+    for (weight, bias), arrays in zip(start, folded.layers, strict=True):
+        close(weight.numpy(), rows_of(torch.from_numpy(arrays.weight)).numpy())
+        close(bias.numpy(), arrays.bias)
 
 
 @given(cases(("pixels",), padded_first=False))
