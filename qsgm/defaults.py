@@ -9,7 +9,6 @@ LAYERS = 3  # tuned
 # Of the SGMs: as accurate as int8 and the quicker one at these widths (docs/cost.md).
 PRECISION: Literal["int8", "float"] = "float"
 SLIM_BLOCKS = "4,5,6"  # those, each on its own
-MOST_LAYERS = 6  # that can be tuned
 PROBE_EVERY = 25  # steps: once per epoch
 CALIBRATION_FRAMES = 24
 THREAD_COUNTS = "1,2" if (os.cpu_count() or 1) > 1 else "1"  # of single steps, in `bench speed`

@@ -67,6 +67,12 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return err
 
 
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert cli.run([*map(str, arguments)]) == 0
+    return capsys.readouterr().out
+
+
 def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
     capsys.readouterr()
     assert cli.run([*map(str, arguments), "--json"]) == 0
@@ -116,16 +122,59 @@ def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
     assert "answers alone" in refused(capsys, *two)
 
 
-def test_among_objects_a_tuned_network_is_said_to_be_no_object(
+def test_among_objects_a_tuned_network_says_what_it_is(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = samples(tmp_path / "hand.npz")
     printed(capsys, "finetune", "--bundle", made / "mine", "--task", FILE, path)
     (listed,) = printed(capsys, "objects", "list")["objects"]
-    assert (listed["name"], listed["last"]) == ("hand", True)
-    assert "tuned network of another task" in listed["problem"]
+    said = {key: listed[key] for key in ("name", "task", "last", "problem", "patch", "scale")}
+    assert said == {"name": "hand", "task": "digits", "last": True, "problem": None} | {
+        "patch": False,
+        "scale": None,
+    }
+    assert "(digits) *" in run(capsys, "objects", "list")
+    shown = printed(capsys, "objects", "show", "hand")
+    assert (shown["input_shape"], shown["input_kind"], shown["layers"]) == ([8, 8, 1], "pixels", 4)
+    assert shown["made"]["seed"] == 0
+    assert "cross_entropy, 10 channels, softmax" in run(capsys, "objects", "show", "hand")
+    copied = printed(capsys, "objects", "export", "hand", "-o", tmp_path / "hand.onnx")
+    assert copied["heads"] == shown["heads"] == heads_to_json(digits().heads)
+    assert (tmp_path / "hand.onnx").read_bytes() == (
+        Path(listed["folder"]) / "network.onnx"
+    ).read_bytes()
+    printed(capsys, "objects", "rename", "hand", "mine")
+    assert printed(capsys, "predict", "--object", "mine", path)["object"] == "mine"
+    assert "pass `qsgm predict` its samples" in refused(capsys, "watch", tmp_path)
+    printed(capsys, "objects", "rename", "mine", "hand")
     assert printed(capsys, "predict", "--object", "hand", path)["object"] == "hand"
     assert printed(capsys, "objects", "remove", "hand", "--yes")["removed"] == listed["folder"]
+
+
+def test_gradients_can_be_compared_along_one_run(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = ["--bundle", made / "mine", "--task", FILE]
+    path = samples(tmp_path / "hand.npz", 100)
+    values = printed(capsys, "fidelity", *own, "--every", 20, path)
+    assert (values["layers"], [*values["fidelity"]]) == (2, ["3"])
+    assert [one["step"] for one in values["fidelity_over_run"]] == [0, 20, 40, 60]
+    every = printed(capsys, "fidelity", *own, "--layers", 4, "--epochs", 1, path)
+    assert [*every["fidelity"]] == ["1", "2", "3"]
+    assert "--center concerns" in refused(capsys, "fidelity", *own, "--center", "1,1", path)
+    assert "pass --task FILE.py" in refused(capsys, "fidelity", *own[:2], path)
+    assert "choose 1 to 4" in refused(capsys, "finetune", *own, "--layers", 7, path)
+
+
+def test_what_benchmarks_count_is_counted_of_any_network(
+    made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = printed(capsys, "bench", "resources", "--repeats", 1, "--bundle", made / "mine")
+    assert (values["paper"], [*values["layers"]]) == ({}, ["1", "2", "3", "4"])
+    assert "Table 3" not in run(
+        capsys, "bench", "resources", "--repeats", 1, "--bundle", made / "mine"
+    )
+    assert "expected 'grasp'" in refused(capsys, "bench", "accuracy", "--bundle", made / "mine")
 
 
 def test_without_its_task_a_bundle_is_refused_in_one_line(

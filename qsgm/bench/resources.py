@@ -21,6 +21,7 @@ from rich.table import Table
 
 from qsgm.bench.timing import step_seconds
 from qsgm.bundle import Bundle
+from qsgm.grasp.network import GRASPNET
 from qsgm.manifest import FLOAT_BYTES
 from qsgm.network import ONE, Network
 from qsgm.progress import Progress
@@ -80,6 +81,8 @@ def measure_resources(
 ) -> dict[str, Any]:
     """Count a bundle's layers and SGMs, and time steps of any number of them.
 
+    The paper's table stands beside those of its own network.
+
     Args:
         bundle: whose layers and SGMs they are.
         repeats: steps of every variant, in turns; medians are kept.
@@ -108,6 +111,7 @@ def measure_resources(
                 "printed": asdict(PUBLISHED[number]),
             }
             for number in layers
+            if network == GRASPNET
         },
         "layers": {str(cost["layer"]): cost for cost in costs},
         "steps": steps,
@@ -218,10 +222,10 @@ def step_macs(costs: Sequence[Cost]) -> dict[str, int]:
 def render(values: Values) -> RenderableType:
     """The paper's table, this bundle's, and whole steps."""
     layers = values["layers"].values()
+    paper = values["paper"]
+    printed = (paper_table(paper), paper_sgm_table(paper), legend(PAPER_LEGEND)) if paper else ()
     return Group(
-        paper_table(values["paper"]),
-        paper_sgm_table(values["paper"]),
-        legend(PAPER_LEGEND),
+        *printed,
         mac_table(layers),
         bytes_table(layers),
         legend(BUNDLE_LEGEND),

@@ -31,6 +31,7 @@ from qsgm.cli.options import (
     value_of,
 )
 from qsgm.errors import QsgmError
+from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
     from qsgm.bench.frames import BenchFrame
@@ -258,7 +259,7 @@ def bench_memory(
 def bench_fidelity(
     frames: FramesOption = None,
     layers: Annotated[
-        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
+        int, typer.Option(min=2, max=MOST_LAYERS, help="The last one has no SGM.")
     ] = defaults.LAYERS,
     epochs: EpochsOption = defaults.EPOCHS,
     limit: LimitOption = None,

@@ -64,12 +64,14 @@ from qsgm.cli.samples import (
 )
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError, as_text
+from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
     from qsgm.grasp.others import Other
     from qsgm.grasp.source import Demonstration
     from qsgm.grasp.taught import FinetuneResult
+    from qsgm.tune.result import Result
     from qsgm.tune.settings import Settings
 
 app = typer.Typer()
@@ -190,7 +192,7 @@ def finetune(
         int | None,
         typer.Option(
             min=1,
-            max=defaults.MOST_LAYERS,
+            max=MOST_LAYERS,
             help="How many of the last to tune.",
             show_default=str(defaults.LAYERS),
         ),
@@ -274,8 +276,8 @@ def predict(
     with its name and whether it was `found`. With one, `objects` is what --all found of it.
     """
     from qsgm.grasp.sights import look_for, sights_json, sights_picture, sights_table
-    from qsgm.grasp.store import find_objects, load_objects
     from qsgm.images import check_png_name, read_frame, write_png
+    from qsgm.store import find_objects, load_objects
 
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
@@ -305,8 +307,14 @@ def fidelity(
         bool, typer.Option("--int8/--float", help="Precision of the SGMs that drive the run.")
     ] = True,
     layers: Annotated[
-        int, typer.Option(min=2, max=defaults.MOST_LAYERS, help="The last one has no SGM.")
-    ] = defaults.LAYERS,
+        int | None,
+        typer.Option(
+            min=2,
+            max=MOST_LAYERS,
+            help="The last one has no SGM.",
+            show_default=str(defaults.LAYERS),
+        ),
+    ] = None,
     trunk: TrunkOption = None,
     optimizer: OptimizerOption = None,
     epochs: EpochsOption = defaults.EPOCHS,
@@ -322,6 +330,7 @@ def fidelity(
         typer.Option(metavar="FILE", help="Draw the metrics over the run, a PNG (matplotlib)."),
     ] = None,
     threads: ThreadsOption = 1,
+    task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
@@ -329,17 +338,27 @@ def fidelity(
 
     if picture is not None:
         host_module("matplotlib")
+    tuned = tuned_layers(layers, None)
     settings = settings_of(
-        int8, MethodName.SGM, layers, optimizer, epochs, seed, threads, trunk=trunk
+        int8, MethodName.SGM, tuned, optimizer, epochs, seed, threads, trunk=trunk
     )
     settings = replace(settings, probe_every=every)
     for path in (output, picture):
         check_output(path, frame)
-    result = _finetune([frame], [parsed_center(center)], (), open_bundle(bundle), settings)
+    opened = open_bundle(bundle)
+    result: Result
+    if is_of_samples(opened, task):
+        refuse_options(center=center is not None)
+        result = learn_task(task, [frame], opened, settings, usual_layers=layers is None)
+    else:
+        result = _finetune([frame], [parsed_center(center)], (), opened, settings)
+    tuned = result.plan.settings.layers
+    if tuned == 1:
+        raise QsgmError("one layer has no SGM, so there is nothing to compare; pass --layers 2")
     if not result.probes:
         raise QsgmError(
-            f"the bundle {result.prepared.bundle.folder} has no probe for {layers} layers, so "
-            "there is nothing to compare; export it again with `qsgm fold-and-quantize`"
+            f"the bundle {opened.folder} has no probe for {tuned} layers, so there is nothing to "
+            "compare; export it again with `qsgm fold-and-quantize`"
         )
     report = fidelity_command_json(result, as_text(paths.name_of(frame)))
     if picture is not None:

@@ -15,9 +15,9 @@ from qsgm.errors import QsgmError, as_text
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from qsgm.grasp.store import StoredObject
+    from qsgm.store import StoredObject
 
-app = typer.Typer(help="This user's taught objects.")
+app = typer.Typer(help="This user's taught objects and tuned networks.")
 NameArgument = Annotated[
     Path, typer.Argument(metavar="NAME", help="An object's name, or its folder.")
 ]
@@ -27,7 +27,7 @@ NameArgument = Annotated[
 def list_objects(as_json: JsonOption = False) -> None:
     """List them: when and on what each was taught, and whether it can be used."""
     from qsgm import paths
-    from qsgm.grasp.store import stored_objects
+    from qsgm.store import stored_objects
 
     found = stored_objects()
     values = {
@@ -40,12 +40,13 @@ def list_objects(as_json: JsonOption = False) -> None:
 @app.command("show")
 def show_object(name: NameArgument, as_json: JsonOption = False) -> None:
     """Show all that one of them says of itself."""
-    from qsgm.grasp.store import find_object, stored_object
+    from qsgm.store import find_object, stored_object
     from qsgm.tables import table
 
     values = stored_object(find_object(name, names_first=True)).details_json()
-    flat = {key: value for key, value in values.items() if not isinstance(value, dict)}
+    flat = {key: value for key, value in values.items() if key not in ("versions", "made", "heads")}
     rows = [(key.replace("_", " "), as_text(str(value), 5000)) for key, value in flat.items()]
+    rows += [(f"head: {as_text(one['name'])}", head_told(one)) for one in values.get("heads", ())]
     rows += [(f"made: {key}", as_text(str(value), 5000)) for key, value in values["made"].items()]
     shown = table(None, ("", ""), rows, left=(0, 1))
     for column in shown.columns:
@@ -61,7 +62,7 @@ def remove(
     as_json: JsonOption = False,
 ) -> None:
     """Remove one of them for good: its network, its patch, its report."""
-    from qsgm.grasp.store import check_object, find_object, remove_object
+    from qsgm.store import check_object, find_object, remove_object
 
     folder = find_object(name, names_first=True)
     check_object(folder)
@@ -78,7 +79,7 @@ def rename(
     as_json: JsonOption = False,
 ) -> None:
     """Give one of them another name."""
-    from qsgm.grasp.store import find_object, rename_object
+    from qsgm.store import find_object, rename_object
 
     old = find_object(name, names_first=True)
     folder = rename_object(old, new)
@@ -95,10 +96,10 @@ def export(
     """Copy its graph out: a plain ONNX file, frame in, heatmap out.
 
     --json says what reading the answers takes: what to scale frames by, how far to mirror them
-    beyond their border, the angle to subtract.
+    beyond their border, the angle to subtract; of a network of your own its inputs and heads.
     """
     from qsgm.files import write_bytes_atomic
-    from qsgm.grasp.store import find_object, graph_of
+    from qsgm.store import find_object, graph_of
 
     if output.suffix.lower() != ".onnx":
         raise QsgmError(f"cannot write {output}: a graph is ONNX; pass a name that ends in .onnx")
@@ -107,6 +108,12 @@ def export(
     network, values = graph_of(folder)
     write_bytes_atomic(output, network)
     _done(values | {"output": str(output)}, "graph", output, as_json)
+
+
+def head_told(head: dict[str, Any]) -> str:
+    """A head in a few words."""
+    channels = head["channels"]
+    return f"{head['kind']}, {channels} channel{'s' * (channels > 1)}, {head['activation']}"
 
 
 def _done(values: dict[str, Any], what: str, path: Path, as_json: bool) -> None:
@@ -135,7 +142,8 @@ def _listing(found: "list[StoredObject]") -> "RenderableType":
     for one in found:
         values = one.to_json()
         taught, bundle = values["taught"] or "-", values["bundle_sha256"]
-        name = f"{one.name} *" if one.last else one.name
+        own = "" if values["task"] in (None, "grasp") else f" ({values['task']})"
+        name = f"{one.name}{own} *" if one.last else f"{one.name}{own}"
         size, patch = f"{values['bytes'] / 1000:.0f} KB", "yes" if values["patch"] else "no"
         scale = None if values["scale"] is None else f"{values['scale']:.2f}"
         when = taught[:16].replace("T", " ")

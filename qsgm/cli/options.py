@@ -9,6 +9,7 @@ import typer
 from qsgm import defaults
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError
+from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
     from qsgm.bench.calibration import Variant
@@ -125,7 +126,7 @@ PrecisionOption = Annotated[
 ]
 MethodOption = Annotated[MethodName, typer.Option(help="Synthetic gradients or backpropagation.")]
 LayersOption = Annotated[
-    int, typer.Option(min=1, max=defaults.MOST_LAYERS, help="How many of the last to tune.")
+    int, typer.Option(min=1, max=MOST_LAYERS, help="How many of the last to tune.")
 ]
 BlocksOption = Annotated[
     str | None,
@@ -263,10 +264,9 @@ def parsed_run_lengths(text: str) -> tuple[int, ...]:
 def parsed_layer_counts(text: str) -> tuple[int, ...]:
     """How many layers to tune, such as 3,6, or none."""
     counts = numbers(text) if text else ()
-    if not all(1 <= count <= defaults.MOST_LAYERS for count in counts):
+    if not all(1 <= count <= MOST_LAYERS for count in counts):
         raise typer.BadParameter(
-            f"{text!r} gives no numbers of layers: expected 1 to {defaults.MOST_LAYERS}, such as "
-            "3,6",
+            f"{text!r} gives no numbers of layers: expected 1 to {MOST_LAYERS}, such as 3,6",
             param_hint="'--processes'",
         )
     return counts

@@ -46,9 +46,9 @@ def watch(
     until there. How fast it went is said on stderr. Cameras are read through OpenCV and were
     never tried: there was none.
     """
-    from qsgm.grasp.store import load_objects
     from qsgm.grasp.watch import check_video_name, new_video, open_stream
     from qsgm.grasp.watch import watch as watched
+    from qsgm.store import load_objects
 
     if output is not None:
         check_video_name(output)

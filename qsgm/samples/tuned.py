@@ -3,13 +3,14 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.errors import QsgmError
+from qsgm.errors import QsgmError, as_text
 from qsgm.files import new_folder, read_file, read_whole
 from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
 from qsgm.network import Network
@@ -24,6 +25,15 @@ REPORT = "report.json"
 MOST_BYTES = 256_000_000
 _COMMAND = "qsgm finetune -o DIR"
 _ADVICE = "tune it again with `qsgm finetune`"
+
+
+@dataclass(frozen=True)
+class NetworkDescription:
+    """What a tuned network's folder says of it."""
+
+    name: str
+    task: TaskRecord
+    made: Mapping[str, Any]  # by what
 
 
 class TunedNetwork:
@@ -97,10 +107,20 @@ def load_network(folder: Path, threads: int = 1) -> TunedNetwork:
     Raises:
         QsgmError: something is missing or altered, or this is no tuned network.
     """
-    return read_whole(folder, lambda: _load(folder, threads))
+    about, network = read_network(folder)
+    return TunedNetwork(about.name, about.task, network, threads)
 
 
-def _load(folder: Path, threads: int) -> TunedNetwork:
+def read_network(folder: Path) -> tuple[NetworkDescription, bytes]:
+    """What a tuned network's folder says, and the network as an ONNX file; nothing is run.
+
+    Raises:
+        QsgmError: something is missing or altered, or this is no tuned network.
+    """
+    return read_whole(folder, lambda: _read(folder))
+
+
+def _read(folder: Path) -> tuple[NetworkDescription, bytes]:
     path = folder / DESCRIPTION
     data = read_file(path, MANIFEST_BYTES, "a tuned network")
     values = parse_description(data, path, FORMAT, (VERSION,), _COMMAND)
@@ -119,5 +139,7 @@ def _load(folder: Path, threads: int) -> TunedNetwork:
         raise QsgmError(
             f"{folder / NETWORK} is not the file it was (its sha256 differs); {_ADVICE}"
         )
-    task = TaskRecord(settings.pop("name"), network, heads, settings)
-    return TunedNetwork(values["name"], task, content, threads)
+    task = TaskRecord(as_text(settings.pop("name")), network, heads, settings)
+    made = values.get("made")
+    known = made if isinstance(made, dict) else {}
+    return NetworkDescription(as_text(values["name"]), task, known), content

@@ -20,7 +20,7 @@ def drift_warnings(fidelity: Mapping[int, LayerFidelity], advice: str) -> tuple[
     """One line for every SGM that its ranges make unfaithful; `advice` ends it."""
     return tuple(
         f"layer {k}: int8 gradients are at a cosine of {layer.cos_int8_float:.2f} to the float "
-        f"ones{reason(layer)}: this object is unlike the calibration set; {advice}"
+        f"ones{reason(layer)}: what is learnt from is unlike the calibration set; {advice}"
         for k, layer in fidelity.items()
         if layer.cos_int8_float < LEAST_COSINE
     )

@@ -9,11 +9,10 @@ from command_line import Run, assert_refused
 from toy_objects import both_on_a_table, hook, teach
 from toys import toy
 
-from qsgm import QsgmError, files, load_object, paths
-from qsgm.grasp import store
-from qsgm.grasp.store import find_object, remove_object, rename_object, stored_objects
+from qsgm import QsgmError, files, load_object, paths, store
 from qsgm.images import write_png
 from qsgm.manifest import NETWORK
+from qsgm.store import find_object, remove_object, rename_object, stored_objects
 
 
 @pytest.fixture
@@ -42,6 +41,7 @@ def test_an_object_is_listed_with_what_it_was_made_of(qsgm: Run, mug: Path) -> N
     assert one["taught"].startswith("20")
     assert {key: value for key, value in one.items() if key != "taught"} == {
         "name": "mug",
+        "task": "grasp",
         "folder": str(mug),
         "frames": 2,
         "scale": 1.0,

@@ -1,4 +1,4 @@
-"""The user's taught objects: found by folder or name, described, removed, renamed."""
+"""The user's tuned objects and networks: found by folder or name, described, removed, renamed."""
 
 import json
 import math
@@ -13,6 +13,7 @@ from typing import Any
 from qsgm import paths
 from qsgm.errors import QsgmError, as_text
 from qsgm.files import is_plain, new_folder, remove_folder
+from qsgm.grasp.task import NAME as GRASP
 from qsgm.grasp.tuned import (
     DESCRIPTION,
     MARGIN_PX,
@@ -23,19 +24,22 @@ from qsgm.grasp.tuned import (
     read_object,
 )
 from qsgm.manifest import NETWORK
+from qsgm.samples.tuned import NetworkDescription, read_network, task_named_in
 from qsgm.tables import number
+from qsgm.task import heads_to_json
 
 LONGEST_NAME = 200
 _LIBRARIES = ("qsgm", "onnxruntime", "opencv", "numpy")
 _MADE = (*_LIBRARIES, "bundle_sha256", "seed", "frames_sha256", "others_sha256")
+Description = ObjectDescription | NetworkDescription
 
 
 @dataclass(frozen=True)
 class StoredObject:
-    """An object's folder, and what it says of itself."""
+    """An object's or a network's folder, and what it says of itself."""
 
     folder: Path
-    about: ObjectDescription | None  # None: it cannot be used
+    about: Description | None  # None: it cannot be used
     problem: str | None  # why
     last: bool  # whether `predict` uses it without being told
 
@@ -54,12 +58,13 @@ class StoredObject:
             taught = datetime.fromtimestamp((self.folder / NETWORK).stat().st_mtime)
         return {
             "name": self.name,
+            "task": None if about is None else _task_of(about),
             "folder": str(self.folder),
             "taught": None if taught is None else taught.astimezone().isoformat(timespec="seconds"),
             "frames": len(frames) if isinstance(frames, list) else None,
-            "scale": None if about is None else number(about.scale, 5),
+            "scale": number(about.scale, 5) if isinstance(about, ObjectDescription) else None,
             "bytes": _bytes_in(self.folder),
-            "patch": about is not None and bool(about.views),
+            "patch": isinstance(about, ObjectDescription) and bool(about.views),
             "bundle_sha256": _text(made.get("bundle_sha256")),
             "versions": {one: _text(version) for one, version in versions.items()},
             "last": self.last,
@@ -71,12 +76,11 @@ class StoredObject:
         about = self.about
         if about is None:
             raise QsgmError(str(self.problem))
-        return self.to_json() | {
-            **_reading(about),
-            "views": len(about.views),
-            "decision": about.decision is not None,
-            "made": {key: _plain(about.made.get(key)) for key in _MADE},
-        }
+        looks = {}
+        if isinstance(about, ObjectDescription):
+            looks = {"views": len(about.views), "decision": about.decision is not None}
+        made = {"made": {key: _plain(about.made.get(key)) for key in _MADE}}
+        return self.to_json() | _reading(about) | looks | made
 
 
 def stored_objects() -> list[StoredObject]:
@@ -99,9 +103,18 @@ def stored_object(folder: Path) -> StoredObject:
     """What an object's folder says, without running anything."""
     last = paths.is_last_object(folder)
     try:
-        return StoredObject(folder, read_object(folder)[0], None, last)
+        return StoredObject(folder, described(folder)[0], None, last)
     except QsgmError as error:
         return StoredObject(folder, None, str(error), last)
+
+
+def described(folder: Path) -> tuple[Description, bytes]:
+    """What a folder says of its object or network, and the latter as an ONNX file; nothing runs.
+
+    Raises:
+        QsgmError: it is missing, altered, or something else.
+    """
+    return read_object(folder) if task_named_in(folder) is None else read_network(folder)
 
 
 def find_object(given: Path, *, names_first: bool = False) -> Path:
@@ -174,9 +187,11 @@ def graph_of(folder: Path) -> tuple[bytes, dict[str, Any]]:
     Raises:
         QsgmError: the object cannot be used.
     """
-    about, network = read_object(folder)
-    margin_px = MARGIN_PX if about.views else 0
-    return network, {"object": about.name, **_reading(about), "margin_px": margin_px}
+    about, network = described(folder)
+    values = {"object": about.name, **_reading(about)}
+    if isinstance(about, ObjectDescription):
+        values["margin_px"] = MARGIN_PX if about.views else 0
+    return network, values
 
 
 def remove_object(folder: Path) -> None:
@@ -215,7 +230,7 @@ def rename_object(folder: Path, name: str) -> Path:
         shutil.copytree(folder, copy, dirs_exist_ok=True)
         values = json.loads((copy / DESCRIPTION).read_bytes()) | {"name": name}
         (copy / DESCRIPTION).write_text(json.dumps(values, indent=1) + "\n")
-        read_object(copy)  # damaged before, or replaced while it was copied
+        described(copy)  # damaged before, or replaced while it was copied
     if last:
         paths.remember_object(new)
     remove_folder(folder, DESCRIPTION)
@@ -236,7 +251,16 @@ def _bytes_in(folder: Path) -> int:
     return 0
 
 
-def _reading(about: ObjectDescription) -> dict[str, Any]:
+def _task_of(about: Description) -> str:
+    return about.task.name if isinstance(about, NetworkDescription) else GRASP
+
+
+def _reading(about: Description) -> dict[str, Any]:
+    """What one has to know to give its graph inputs and to understand the answers."""
+    if isinstance(about, NetworkDescription):
+        network, heads = about.task.network, about.task.heads
+        sides = {"input_shape": [*network.input_shape], "input_kind": network.input_kind}
+        return {**sides, "layers": network.depth, "heads": heads_to_json(heads)}
     return {
         "scale": number(about.scale, 5),
         "encoding": about.encoding,
