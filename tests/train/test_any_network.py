@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from losses import HeadsLoss
-from networks import SHAPES, Case, Shape, blocks_of, cases, plain_layer, plain_maps
+from networks import SHALLOW, SHAPES, Case, Shape, blocks_of, cases, plain_layer, plain_maps
 from step_oracles import CROPS, Exported, compare_steps
 from test_fold import shake_norms
 from test_trunk import integer_trunk
@@ -91,7 +91,7 @@ def data_of(case: Case, tuned: int) -> tuple[Tensor, Tensor]:
 
 def made_up(layer: int, activation: Tensor, labels: Tensor) -> Tensor:
     """Stands in for an SGM: anything that depends on layer, activation and label."""
-    return torch.sin(layer * activation) + labels[..., None, :1]
+    return torch.sin(layer + activation) + labels[..., None, :1]
 
 
 @EVERY_SHAPE
@@ -150,8 +150,10 @@ def test_a_step_graph_steps_as_torch(
         "labels": case.labels(CROPS),
     }
     loss = HeadsLoss(case.heads)
-    # What a sample adds to a sum is at most twice its head's weight, times inputs of about one.
-    terms = 2 * sum(head.weight for head in case.heads)
+    # What a sample adds to a sum is at most twice its head's weight, times inputs of about one;
+    # each layer of a deep network hands on the rounding of those in front of it.
+    handed_on = len(blocks.layers) if case.network.depth > SHALLOW else 1
+    terms = 2 * handed_on * sum(head.weight for head in case.heads)
     compare_steps(case.net, blocks, case.sgms(), loss, optimizer, 5, arrays, terms=terms)
 
 
