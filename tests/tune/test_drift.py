@@ -24,7 +24,10 @@ def test_nothing_is_said_of_gradients_that_are_faithful_whatever_clips() -> None
     [
         ({"clipped_fraction": 0.08, "underflow_fraction": 0.4}, ", 8.0 % of what the SGM saw lies"),
         ({"underflow_fraction": 0.4}, ", 40 % of what the SGM saw is too small"),
-        ({"clipped_fraction": NOTABLE_CLIPPING, "underflow_fraction": NOTABLE_UNDERFLOW}, ": this"),
+        (
+            {"clipped_fraction": NOTABLE_CLIPPING, "underflow_fraction": NOTABLE_UNDERFLOW},
+            ": what is learnt from",
+        ),
     ],
 )
 def test_an_unfaithful_sgm_is_named_with_what_its_ranges_do(

@@ -13,8 +13,8 @@ from qsgm import Bundle, Detection, QsgmError, Settings, TunedObject, finetune, 
 from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.pictures import draw_objects
 from qsgm.grasp.sights import look_for, named_places
-from qsgm.grasp.store import load_objects
 from qsgm.images import check_demonstration
+from qsgm.store import load_objects
 from qsgm_ros.images import Frame, fill_image, frame_of
 
 
