@@ -43,7 +43,7 @@ def session_options(threads: int = 1) -> ort.SessionOptions:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3
+    options.log_severity_level = 4  # what it would say of an error is in the exception
     for key, value in _CONFIG.items():
         options.add_session_config_entry(key, value)
     return options
@@ -120,11 +120,15 @@ def check_interface(
         ("gives", outputs, session.get_outputs()),
     ):
         there = {value.name: (value.type, value.shape) for value in values}
-        extra = verb == "takes" and there.keys() - wanted.keys()
-        if extra or not all(key in there and _fits(there[key], wanted[key]) for key in wanted):
-            raise QsgmError(
-                f"{name} {verb} {as_text(str(there))}, expected {dict(wanted)}; {advice}"
+        other = {
+            key for key in wanted if key not in there or not _fits(there[key], wanted[key])
+        } | (there.keys() - wanted.keys() if verb == "takes" else set())
+        if other:
+            got, expected = (
+                as_text(str({key: some[key] for key in some if key in other}))
+                for some in (there, wanted)
             )
+            raise QsgmError(f"{name} {verb} {got}, expected {expected}; {advice}")
 
 
 def _fits(got: Value, wanted: Value) -> bool:

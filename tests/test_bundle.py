@@ -347,7 +347,7 @@ def test_another_graph_under_the_name_of_one_is_refused_when_it_runs(
     manifest["files"][name] = manifest["files"][other]
     path.write_text(json.dumps(manifest))
     with pytest.raises(
-        QsgmError, match=r"(does not fit|has no output) .*export it again with"
+        QsgmError, match=r"(takes|gives) .*expected .*export it again with"
     ) as raised:
         finetune(frame, load_bundle(own_bundle), Settings(epochs=1))
     assert "\n" not in str(raised.value)

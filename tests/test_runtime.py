@@ -249,3 +249,12 @@ def test_a_graph_that_does_not_fit_its_inputs_is_refused_in_one_line(
     with refused as raised, running("it", "mend it"):
         session.run(None, feeds)
     assert "\n" not in str(raised.value)
+
+
+def test_of_a_graph_that_cannot_be_opened_nothing_is_said_but_the_refusal(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    empty = helper.make_model(helper.make_graph([], "empty", [], []), ir_version=8)
+    with pytest.raises(QsgmError, match="cannot load"):
+        open_session(empty.SerializeToString())
+    assert capfd.readouterr() == ("", "")

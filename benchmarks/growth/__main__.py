@@ -26,7 +26,7 @@ from qsgm.bench.frames import list_frames
 from qsgm.bench.timing import step_jobs
 from qsgm.schedule import BATCH
 from qsgm.tables import CLOSE, number, table
-from qsgm.tune.features import running_graphs
+from qsgm.tune.graphs import running_graphs
 
 # A layer in front of an SGM that is timed alone, by the SGM's kernel.
 LAYER_BEFORE = {1: 4, 3: 3}

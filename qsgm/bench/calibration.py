@@ -39,9 +39,10 @@ from qsgm.sgm.int8 import (
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
 from qsgm.tables import TIGHT, keyed_table, number
 from qsgm.task import label_span
+from qsgm.tune.graphs import open_probe
 from qsgm.tune.plan import Plan, resolve
 from qsgm.tune.prepare import Prepared
-from qsgm.tune.probe import activations_of, open_probe
+from qsgm.tune.probe import activations_of
 from qsgm.tune.recalibrate import GROWTH, activations_before, grown, ranges_of, typical_labels
 from qsgm.tune.result import Result
 from qsgm.tune.run import Keeper, train, tune

@@ -9,7 +9,7 @@ from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.bundle import Bundle
 from qsgm.manifest import PRECISIONS, Precision, head_file, step_file
 from qsgm.schedule import BATCH
-from qsgm.tune.features import running_graphs
+from qsgm.tune.graphs import running_graphs
 from qsgm.tune.noop_step import noop_step, random_features, start_of
 
 Job = Callable[[], object]

@@ -2,18 +2,16 @@
 
 import time
 from collections.abc import Iterator, MutableMapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from qsgm.bundle import Bundle
-from qsgm.errors import QsgmError
-from qsgm.manifest import COMMAND
 from qsgm.progress import Progress
-from qsgm.runtime import running
 from qsgm.task import Array, Inputs, Lesson, Rows
+from qsgm.tune.graphs import open_trunk, running_graphs
 from qsgm.tune.plan import Plan
 
 # What the frozen layers leave; where nothing is frozen, the inputs.
@@ -61,17 +59,10 @@ class StreamedFeatures:
         seconds: MutableMapping[str, float],  # crops, features: their time is added there
     ) -> None:
         self._lesson, self._bundle, self._seconds = lesson, bundle, seconds
-        self._session = bundle.session(plan.trunk_file, plan.settings.threads)
-        takes = [value.name for value in self._session.get_inputs()]
-        output, *others = self._session.get_outputs()
-        gives = [value.name for value in (output, *others)]
-        if (takes, gives) != (["samples"], ["features"]):
-            raise QsgmError(
-                f"{plan.trunk_file} of the bundle {bundle.folder} does not fit its name: it takes "
-                f"{takes} and gives {gives}, expected samples and their features; export it again "
-                f"with `{COMMAND}`"
-            )
-        self._shape = tuple(output.shape[1:])
+        self._session = open_trunk(bundle, plan)
+        (output,) = (value for value in self._session.get_outputs() if value.name == "features")
+        first = plan.layers[0]
+        self._shape = bundle.network.positions_before(first), bundle.network.channels_before(first)
         self._dtype = np.dtype(np.uint8 if "uint8" in output.type else np.float32)
 
     def of(self, rows: Rows, watch: Progress | None = None) -> Features:
@@ -82,7 +73,8 @@ class StreamedFeatures:
             with _adding_to(self._seconds, "crops"):
                 inputs = self._lesson.cut(rows[some])
             with _adding_to(self._seconds, "features"), running_graphs(self._bundle):
-                features[some] = self._session.run(["features"], {"samples": inputs})[0]
+                given = self._session.run(["features"], {"samples": inputs})[0]
+                features[some] = given.reshape(len(inputs), *self._shape)
             if watch is not None:
                 watch("crops", some.stop, len(rows))
         return features
@@ -103,11 +95,6 @@ def feature_source(
     if plan.settings.stream:
         return streamed
     return KeptFeatures(streamed.of(np.arange(len(lesson)), watch))
-
-
-def running_graphs(bundle: Bundle) -> AbstractContextManager[None]:
-    """Around every run of a bundle's graph: they are checked when loaded, not for what they do."""
-    return running(f"the bundle {bundle.folder}", f"export it again with `{COMMAND}`")
 
 
 @contextmanager

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from qsgm.schedule import batches, rate_factor, steps_per_epoch
 from qsgm.tune.features import Features
+from qsgm.tune.graphs import NEXT
 
 Array = NDArray[np.float32]
-NEXT = "_next"
 
 
 class StepLoop:

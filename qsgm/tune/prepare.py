@@ -17,8 +17,8 @@ from qsgm.tune.features import (
     Features,
     FeatureSource,
     feature_source,
-    running_graphs,
 )
+from qsgm.tune.graphs import open_head, running_graphs
 from qsgm.tune.plan import Plan
 from qsgm.weights import to_step_layout
 
@@ -91,12 +91,14 @@ def outputs_of(
     source: FeatureSource, rows: Rows, weights: Mapping[str, Array], bundle: Bundle, plan: Plan
 ) -> Array:
     """Activated outputs (B, L) that the tuned layers give for the samples `rows`."""
-    session = bundle.session(plan.head_file, plan.settings.threads)
-    outputs = []
+    session, outputs = open_head(bundle, plan), []
     for first in range(0, len(rows), SLICE):
         features = source.of(rows[first : first + SLICE])
         with running_graphs(bundle):
-            outputs += session.run(["outputs"], {"features": features, **weights})
+            given = session.run(["outputs"], {"features": features, **weights})[0]
+            outputs.append(given.reshape(len(features), bundle.network.outputs))
+            if not np.isfinite(given).all():
+                raise ValueError("it answers with NaN or infinity")
     return np.concatenate(outputs)
 
 

@@ -5,7 +5,7 @@ anew.
 """
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,15 +13,12 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from qsgm.bundle import Bundle
-from qsgm.errors import QsgmError
 from qsgm.fidelity import PROBED, LayerFidelity, compare_probe
-from qsgm.manifest import COMMAND
 from qsgm.runtime import run_options
 from qsgm.schedule import BATCH, steps_per_epoch
 from qsgm.task import Array, Rows
-from qsgm.tune.features import running_graphs
-from qsgm.tune.plan import Overrides, Plan
+from qsgm.tune.graphs import open_probe, running_graphs
+from qsgm.tune.plan import Plan
 from qsgm.tune.prepare import Prepared
 
 # Samples that a probe looks at together, where activations take much memory.
@@ -37,17 +34,6 @@ class Probe:
     layers: dict[int, LayerFidelity]  # by SGM layer
 
 
-def open_probe(bundle: Bundle, plan: Plan) -> ort.InferenceSession:
-    """A session of the probe graph. Raises QsgmError where the bundle has none."""
-    if not bundle.has(plan.probe_file):
-        raise QsgmError(
-            f"the bundle {bundle.folder} has no {plan.probe_file}, by which SGMs are looked at; "
-            f"export it again with `{COMMAND}`"
-        )
-    constants = constants_of(plan.overrides, plan.layers)
-    return bundle.session(plan.probe_file, plan.settings.threads, constants)
-
-
 def activations_of(
     session: ort.InferenceSession,  # of the probe graph
     prepared: Prepared,
@@ -61,7 +47,9 @@ def activations_of(
     names = [f"activation{layer}" for layer in layers]
     with running_graphs(prepared.bundle):
         values = session.run(names, feeds, run_options(whole_graph=False))
-    return dict(zip(layers, values, strict=True))
+        shapes = [(len(rows), -1, prepared.bundle.network.layer(k).out) for k in layers]
+        found = [one.reshape(shape) for one, shape in zip(values, shapes, strict=True)]
+    return dict(zip(layers, found, strict=True))
 
 
 def feeds_of(
@@ -70,11 +58,6 @@ def feeds_of(
     """What the probe graph takes to look at the samples `rows`."""
     features, labels, among = prepared.batch(rows)
     return {"features": features, "labels": labels, "rows": among, **weights}
-
-
-def constants_of(overrides: Overrides, layers: Collection[int]) -> dict[str, NDArray[Any]]:
-    """Overriding constants of the SGMs behind `layers`, by initializer name."""
-    return {name: array for layer in layers for name, array in overrides.get(layer, {}).items()}
 
 
 def whole_batch(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
@@ -114,7 +97,6 @@ class Prober:
         self._prepared, self._bundle = prepared, prepared.bundle
         if self._layers and prepared.bundle.has(plan.probe_file):
             self._session = open_probe(prepared.bundle, plan)
-            self._refuse_unless_complete(plan.probe_file, self._session)
         self.seconds = time.perf_counter() - began
         self.looking = 0.0  # seconds of that while the run went on
 
@@ -127,7 +109,8 @@ class Prober:
         rows = self._rng.choice(taught, self._batch, replace=False)
         pieces = np.split(rows, range(self._at_once, len(rows), self._at_once))
         parts = [self._outputs(some, weights) for some in pieces]
-        found = compare_probe(whole_batch(parts), self._layers)
+        with running_graphs(self._bundle):
+            found = compare_probe(whole_batch(parts), self._layers)
         self.probes.append(Probe(step, step / steps_per_epoch(taught), found))
         took = time.perf_counter() - began
         self.seconds, self.looking = self.seconds + took, self.looking + took
@@ -139,12 +122,3 @@ class Prober:
         with running_graphs(self._bundle):
             values = self._session.run(self._names, feeds, self._options)
         return dict(zip(self._names, values, strict=True))
-
-    def _refuse_unless_complete(self, name: str, session: ort.InferenceSession) -> None:
-        there = {output.name for output in session.get_outputs()}
-        missing = [wanted for wanted in self._names if wanted not in there]
-        if missing:
-            raise QsgmError(
-                f"{name} of the bundle {self._bundle.folder} has no output {missing[0]}: another "
-                f"version of qsgm wrote it; export it again with `{COMMAND}`"
-            )

@@ -17,9 +17,10 @@ from qsgm.errors import QsgmError
 from qsgm.sgm.float import FloatArray, FoldedSgm, float_trace
 from qsgm.sgm.int8 import ActivationBits, SgmRanges, constants, quantize_sgm
 from qsgm.task import label_span
+from qsgm.tune.graphs import open_probe
 from qsgm.tune.plan import Overrides, Plan
 from qsgm.tune.prepare import Prepared
-from qsgm.tune.probe import activations_of, open_probe
+from qsgm.tune.probe import activations_of
 
 # Activations grow while layers learn. 16 bits have their headroom for that.
 GROWTH: dict[ActivationBits, float] = {8: 1.5, 16: 1.0}

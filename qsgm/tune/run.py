@@ -18,11 +18,11 @@ from qsgm.runtime import run_options
 from qsgm.schedule import steps_per_epoch
 from qsgm.task import Array, Rows
 from qsgm.tune.drift import drift_warnings
-from qsgm.tune.features import running_graphs
+from qsgm.tune.graphs import open_step, running_graphs
 from qsgm.tune.loop import StepLoop, run_epochs
 from qsgm.tune.plan import Plan
 from qsgm.tune.prepare import Prepared, validate
-from qsgm.tune.probe import Prober, constants_of
+from qsgm.tune.probe import Prober
 from qsgm.tune.recalibrate import recalibrate
 from qsgm.tune.result import Result
 from qsgm.weights import to_conv_layout
@@ -125,9 +125,7 @@ class _Run:
     def __init__(self, prepared: Prepared, plan: Plan, observers: Sequence[Observer]) -> None:
         self._prepared, self._plan, self._observers = prepared, plan, observers
         bundle = prepared.bundle
-        int8_layers = plan.blocks.sgm_layers if plan.precision == "int8" else ()
-        constants = constants_of(plan.overrides, int8_layers)
-        session = bundle.session(plan.step_file, plan.settings.threads, constants)
+        session = open_step(bundle, plan)
         # A probe takes as much as a step: neither keeps its memory while the other runs.
         self._before_look = run_options(give_memory_back=plan.takes_much_memory)
         steps = plan.epochs * steps_per_epoch(prepared.taught)

@@ -40,9 +40,10 @@ from qsgm.grasp.crops import TRAIN_CROPS
 from qsgm.grasp.teach import prepare_object
 from qsgm.sgm.float import float_trace
 from qsgm.sgm.int8 import integer_forward, quantize_sgm
+from qsgm.tune.graphs import open_probe
 from qsgm.tune.plan import Plan, resolve
 from qsgm.tune.prepare import Prepared
-from qsgm.tune.probe import activations_of, open_probe
+from qsgm.tune.probe import activations_of
 from qsgm.tune.run import Keeper, train, tune
 from qsgm.tune.settings import Settings
 from tests.conftest import draw_frame

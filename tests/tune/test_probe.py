@@ -119,7 +119,7 @@ def test_a_bundle_whose_probe_gives_less_is_refused_in_one_line(
         finetune(frame, old, SHORT)
     said = str(caught.value)
     assert "probe_3.onnx of the bundle" in said
-    assert "has no output update_true5" in said
+    assert "gives {}, expected {'update_true5': ('tensor(float)', (16, 17))}" in said
     assert "export it again with `qsgm fold-and-quantize`" in said
     assert "\n" not in said
     plan = resolve(replace(SHORT, epochs=0), old)

@@ -30,8 +30,8 @@ from qsgm.task import label_span
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.sgm import int8_sgm
 from qsgm.train.graphs.sharing import SharedConstants
+from qsgm.tune.graphs import constants_of
 from qsgm.tune.plan import resolve
-from qsgm.tune.probe import constants_of
 from qsgm.tune.recalibrate import activations_before, grown, ranges_of, recalibrated, typical_labels
 from qsgm.tune.settings import Settings
 

@@ -31,7 +31,7 @@ from qsgm.bundle import Bundle
 from qsgm.manifest import Precision, step_file
 from qsgm.runtime import session_options
 from qsgm.train.graphs.inspection import all_nodes, bodies
-from qsgm.tune.features import running_graphs
+from qsgm.tune.graphs import running_graphs
 from qsgm.tune.noop_step import noop_step, start_of
 
 # Their result is their first input under another shape.
