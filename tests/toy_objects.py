@@ -35,12 +35,12 @@ def hook() -> NDArray[np.float32]:
     return picture
 
 
-def teach(folder: Path, name: str, picture: NDArray[np.float32]) -> Path:
-    """Keep an object in a folder."""
+def teach(folder: Path, name: str, picture: NDArray[np.float32], threshold: float = 0.6) -> Path:
+    """Keep an object in a folder; it is found where its patch correlates as well as that."""
     center = (320.0, 240.0)
     patch = cut_patch(lay(picture, table(), center), center)
     view = View(patch, 0.0, whole=True)
-    about = ObjectDescription(name, "double", 0.0, 1.0, (view,), by_correlation(), MADE)
+    about = ObjectDescription(name, "double", 0.0, 1.0, (view,), by_correlation(threshold), MADE)
     save_object(folder, about, load_bundle(paths.bundle_folder()).network_with({}), {"seed": 0})
     return folder
 

@@ -20,6 +20,7 @@ from qsgm.cli.console import (
 )
 from qsgm.cli.options import (
     ActivationBitsChoice,
+    AnyDistanceOption,
     BlocksOption,
     BundleOption,
     CalibratorName,
@@ -257,12 +258,7 @@ def predict(
     everything: Annotated[
         bool, typer.Option("--all", help="List every instance of the object.")
     ] = False,
-    any_distance: Annotated[
-        bool,
-        typer.Option(
-            "--any-distance", help="Where it is not found, look at half to twice the distance, too."
-        ),
-    ] = False,
+    any_distance: AnyDistanceOption = False,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,
@@ -275,7 +271,7 @@ def predict(
     With several, --json describes the surest one and lists all of them as `objects`, each entry
     with its name and whether it was `found`. With one, `objects` is what --all found of it.
     """
-    from qsgm.grasp.sights import look_for, sights_json, sights_picture, sights_table
+    from qsgm.grasp.sights import look_for_each, sights_json, sights_picture, sights_table
     from qsgm.images import check_png_name, read_frame, write_png
     from qsgm.store import find_objects, load_objects
 
@@ -290,9 +286,7 @@ def predict(
         check_output(output, scene)
     objects = load_objects(folders, threads)
     frame = read_frame(scene)
-    sights = [
-        look_for(one, frame, everything=everything, any_distance=any_distance) for one in objects
-    ]
+    sights = look_for_each(objects, frame, everything=everything, any_distance=any_distance)
     if output is not None:
         write_png(output, sights_picture(frame, sights))
     show(sights_json(sights, output), sights_table(sights), as_json)

@@ -117,6 +117,12 @@ ObjectsOption = Annotated[
         help="Tuned object, a folder or one of yours by name; repeatable; default: the last one.",
     ),
 ]
+AnyDistanceOption = Annotated[
+    bool,
+    typer.Option(
+        "--any-distance", help="Where it is not found, look at half to twice the distance, too."
+    ),
+]
 BundleOption = Annotated[
     Path | None, typer.Option("--bundle", metavar="DIR", help="Bundle; default: the shipped one.")
 ]

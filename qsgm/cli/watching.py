@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qsgm.cli.console import check_output, print_json
-from qsgm.cli.options import ObjectsOption, ThreadsOption
+from qsgm.cli.options import AnyDistanceOption, ObjectsOption, ThreadsOption
 from qsgm.cli.streams import complain
-from qsgm.errors import as_text
+from qsgm.errors import QsgmError, as_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -34,6 +34,7 @@ def watch(
     tuned: ObjectsOption = None,
     every: Annotated[int, typer.Option(min=1, help="Look at one frame in so many.")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="At so many frames at most.")] = None,
+    any_distance: AnyDistanceOption = False,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="FILE.avi", help="Write an annotated video."),
@@ -57,7 +58,8 @@ def watch(
     stream = open_stream(source, every)
     video = nullcontext() if output is None else new_video(output, stream.rate)
     with video as write:
-        ended = _follow(watched(stream, objects, limit=limit), write)
+        seen = watched(stream, objects, limit=limit, any_distance=any_distance)
+        ended = _follow(seen, write)
     if output is not None:
         complain(f"video: {as_text(str(output), 5000)}")
     if ended is not None:
@@ -69,20 +71,26 @@ def _follow(
 ) -> BaseException | None:
     """Print and draw what is seen; what ended it, if that was not the stream.
 
-    An interrupt, or a reader of stdout that goes away, is how watching a camera ends. Where nothing
-    was seen before, it is raised.
+    An interrupt, or a reader of stdout that goes away, is how watching a camera ends; a disk that
+    its lines fill ends it, too. Where nothing was seen before, it is raised.
     """
     latencies: deque[float] = deque(maxlen=_REMEMBERED)
-    frames, start, ended = 0, time.monotonic(), None
+    frames, start = 0, time.monotonic()
+    ended: BaseException | None = None
     try:
         for seen in watched:
             latencies.append(seen.latency_ms)
             frames += 1
-            print_json(seen.to_json())
+            try:
+                print_json(seen.to_json())
+            except (QsgmError, SystemExit) as error:  # what was seen is kept
+                ended = error
             if write is not None and not write(seen.picture()):
                 complain("note: the video is as large as AVI allows, so watching ends")
                 break
-    except (KeyboardInterrupt, SystemExit) as error:
+            if ended is not None:
+                break
+    except KeyboardInterrupt as error:
         if frames == 0:
             raise
         ended = error

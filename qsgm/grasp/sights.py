@@ -4,8 +4,9 @@ Each object looks by itself. What those of one bundle share, the frozen layers, 
 the 85 to 100 that a look takes; the rest is the comparison with the object's own patch.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ from qsgm.grasp.report import (
     predict_json,
     turn_text,
 )
-from qsgm.grasp.tuned import TunedObject
+from qsgm.grasp.tuned import FOUND_FROM, TunedObject
 from qsgm.tables import number, table
+
+# Two things as large as objects are at the scale of either have centres further apart.
+_ONE_THING_PX = 24.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,75 @@ def look_for(
     detection, heatmap = look(frame)
     instances = tuple(tuned.locate_all(frame)) if everything else None
     return Sight(tuned.description.name, detection, heatmap, instances)
+
+
+def look_for_each(
+    objects: Sequence[TunedObject],
+    frame: NDArray[np.uint8],
+    *,
+    everything: bool = False,
+    any_distance: bool = False,
+) -> tuple[Sight, ...]:
+    """Look for several objects, see :func:`look_for`; of two at one place it is the surer one's."""
+    return shared_out(
+        [look_for(one, frame, everything=everything, any_distance=any_distance) for one in objects]
+    )
+
+
+def shared_out(sights: Sequence[Sight]) -> tuple[Sight, ...]:
+    """Sights in which no two objects are found in one place.
+
+    The surest claim comes first. Whoever loses a place takes its next candidate, and where none is
+    left that is sure enough, it is not found.
+    """
+    claims = [
+        (place, owner)
+        for owner, sight in enumerate(sights)
+        for place in (_guesses(sight) if sight.instances is None else sight.instances)
+        if place.found
+    ]
+    kept: list[tuple[Detection, int]] = []
+    for place, owner in sorted(claims, key=lambda claim: -claim[0].quality):
+        done = sights[owner].instances is None and any(owner == other for _, other in kept)
+        if not done and not _taken(place, owner, kept):
+            kept.append((place, owner))
+    return tuple(_left_with(sight, owner, kept) for owner, sight in enumerate(sights))
+
+
+def _left_with(sight: Sight, owner: int, kept: Sequence[tuple[Detection, int]]) -> Sight:
+    """What a sight's object is left with: the places it kept, or its best guess elsewhere."""
+    own = tuple(place for place, other in kept if other == owner)
+    free = (one for one in _guesses(sight) if not _taken(one, owner, kept))
+    best = own[0] if own else replace(next(free, sight.detection), found=False)
+    return replace(sight, detection=best, instances=None if sight.instances is None else own)
+
+
+def _guesses(sight: Sight) -> list[Detection]:
+    """The best place, then the other candidates."""
+    best, found = sight.detection, [sight.detection]
+    (x, y), (right, down) = best.center_px, best.displacement_px
+    for one in best.candidates[1:]:
+        place = replace(
+            best,
+            found=one.quality >= FOUND_FROM,
+            quality=one.quality,
+            center_px=one.center_px,
+            displacement_px=(one.center_px[0] - x + right, one.center_px[1] - y + down),
+            angle_deg=one.angle_deg,
+            full_angle_deg=one.full_angle_deg,
+            full_angle_confidence=None,
+        )
+        found.append(place)
+    return found
+
+
+def _taken(place: Detection, owner: int, kept: Sequence[tuple[Detection, int]]) -> bool:
+    """Whether another object was found there."""
+    return any(
+        other != owner
+        and math.dist(place.center_px, one.center_px) < _ONE_THING_PX / max(place.scale, one.scale)
+        for one, other in kept
+    )
 
 
 def surest(sights: Sequence[Sight]) -> Sight:

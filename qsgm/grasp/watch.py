@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from qsgm.errors import QsgmError
 from qsgm.files import new_file
 from qsgm.grasp.pictures import Picture, draw_objects
-from qsgm.grasp.sights import Sight, look_for, named_places
+from qsgm.grasp.sights import Sight, look_for_each, named_places
 from qsgm.grasp.tuned import TunedObject
 from qsgm.images import MAX_SIDE_PX, check_frame, decoding, read_frame
 
@@ -85,6 +85,7 @@ def watch(
     objects: Sequence[TunedObject],
     every: int = 1,
     limit: int | None = None,
+    any_distance: bool = False,
 ) -> Iterator[Watched]:
     """Look for objects in every frame of a source, one after the other.
 
@@ -93,6 +94,7 @@ def watch(
         objects: to look for.
         every: look at one frame in so many.
         limit: at so many frames at most.
+        any_distance: where one is not found, look at half to twice the distance, too.
 
     Raises:
         QsgmError: there is no such source, or a frame cannot be used.
@@ -100,7 +102,7 @@ def watch(
     stream = source if isinstance(source, Stream) else open_stream(source, every)
     for number, seconds, frame in islice(stream.frames, limit):
         start = time.perf_counter()
-        sights = tuple(look_for(one, frame) for one in objects)
+        sights = look_for_each(objects, frame, any_distance=any_distance)
         yield Watched(number, seconds, 1e3 * (time.perf_counter() - start), frame, sights)
 
 

@@ -91,6 +91,32 @@ def test_a_table_and_a_picture_show_what_is_where_and_what_is_not(
     assert set((drawn[0] // 480).tolist()) == {0, 1}  # the toy above, the hook's name below
 
 
+def test_a_place_that_look_alikes_claim_is_the_surer_ones(qsgm: Run, scene: Path) -> None:
+    """The twin is the toy with a spot: alone it takes the toy for itself."""
+    twin = toy()
+    cv2.circle(twin, (270, 240), 28, (20, 30, 60, 255), cv2.FILLED)
+    teach(paths.folder_named("twin"), "twin", twin)
+    write_png(scene, lay(toy(), table(3), TOY_AT, TURN_DEG))
+    alone = qsgm("predict", "--json", "--object", "twin", scene).json
+    assert alone["found"]
+    assert math.dist(alone["center_px"], TOY_AT) < 3
+    for order in (("toy", "twin"), ("twin", "toy")):
+        options = [text for name in order for text in ("--object", name)]
+        values = qsgm("predict", "--json", *options, scene).json
+        entries = {one["object"]: one for one in values["objects"]}
+        assert (values["object"], values["found"]) == ("toy", True)
+        assert set(entries["twin"]) == set(entries["toy"]) == ALWAYS
+        assert [entries[name]["found"] for name in ("toy", "twin")] == [True, False]
+        assert math.dist(entries["twin"]["center_px"], TOY_AT) > 24
+    write_png(scene, lay(twin, lay(toy(), table(3), TOY_AT, TURN_DEG), HOOK_AT))
+    for options in ((), ("--all",)):
+        both = ("--object", "twin", "--object", "toy")
+        objects = qsgm("predict", "--json", *options, *both, scene).json["objects"]
+        assert [(one["object"], one["found"]) for one in objects] == [("twin", True), ("toy", True)]
+        assert math.dist(objects[0]["center_px"], HOOK_AT) < 3
+        assert math.dist(objects[1]["center_px"], TOY_AT) < 3
+
+
 def test_two_objects_of_one_name_are_refused(qsgm: Run, scene: Path, tmp_path: Path) -> None:
     teach(tmp_path / "other", "toy", hook())
     for other in (tmp_path / "other", "toy"):

@@ -11,7 +11,7 @@ import cv2
 import pytest
 from command_line import Run, assert_refused
 from toy_objects import TOY_AT, both_on_a_table, hook, teach
-from toys import toy
+from toys import lay, table, toy
 
 from qsgm import paths, watch
 from qsgm.images import write_png
@@ -103,3 +103,39 @@ def test_a_reader_that_goes_away_ends_it_without_a_complaint(belt: Path) -> None
     assert code == "141"
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) == 1  # the summary
+
+
+def test_a_full_disk_behind_stdout_is_one_line_and_the_video_is_whole(
+    belt: Path, tmp_path: Path
+) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    with Path("/dev/full").open("w") as full:
+        command = [*QSGM, "watch", str(belt), "-o", str(tmp_path / "seen.avi")]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    told = done.stderr.splitlines()
+    assert [told[0][:11], told[1][:6]] == ["1 frames in", "video:"]
+    assert told[2].startswith("error: cannot write to standard output: no space left on device")
+    assert told[3:] == []
+    assert len(list(watch(tmp_path / "seen.avi", []))) == 1
+
+
+def test_without_a_stdout_the_video_is_written_all_the_same(belt: Path, tmp_path: Path) -> None:
+    command = f"{' '.join(QSGM)} watch {belt} -o {tmp_path / 'seen.avi'} >&-"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[1] for line in done.stderr.splitlines()][:1] == ["frames"]
+    assert len(list(watch(tmp_path / "seen.avi", []))) == FRAMES
+
+
+def test_any_distance_finds_what_predict_finds_at_another_one(qsgm: Run, tmp_path: Path) -> None:
+    paths.remember_object(teach(paths.folder_named("toy"), "toy", toy(), 0.85))
+    picture = tmp_path / "far.png"
+    write_png(picture, lay(toy(), table(4), TOY_AT, 40, 0.5))
+    (here,) = json.loads(qsgm("watch", picture).out)["objects"]
+    (far,) = json.loads(qsgm("watch", picture, "--any-distance").out)["objects"]
+    assert [here["found"], far["found"]] == [False, True]
+    assert far["center_px"] == pytest.approx(TOY_AT, abs=3)
+    told = qsgm("predict", "--json", "--any-distance", picture).json
+    assert {key: told[key] for key in far} == far
