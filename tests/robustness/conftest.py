@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from qsgm.bundle import Bundle
+
 TIMES = int(os.environ.get("QSGM_ROBUSTNESS", "1"))
 SEED = int(os.environ.get("QSGM_ROBUSTNESS_SEED", "0"))
 HERE = Path(__file__).parent
@@ -56,3 +58,14 @@ def campaign(request: pytest.FixtureRequest) -> Campaign:
         return counts
 
     return run
+
+
+@pytest.fixture(scope="session")
+def networks(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two, of which one differs in a bias."""
+    folder = tmp_path_factory.mktemp("networks")
+    weights = bundle.start_weights(bundle.network.last(1))
+    weights["bias6"] = weights["bias6"] + 1
+    for name, changed in (("old", {}), ("new", weights)):
+        (folder / f"{name}.onnx").write_bytes(bundle.network_with(changed))
+    return [folder / "old.onnx", folder / "new.onnx"]

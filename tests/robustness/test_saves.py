@@ -4,19 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from qsgm.bundle import Bundle
 from robustness.conftest import Campaign
-
-
-@pytest.fixture(scope="session")
-def networks(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two, of which one differs in a bias."""
-    folder = tmp_path_factory.mktemp("networks")
-    weights = bundle.start_weights(bundle.network.last(1))
-    weights["bias6"] = weights["bias6"] + 1
-    for name, changed in (("old", {}), ("new", weights)):
-        (folder / f"{name}.onnx").write_bytes(bundle.network_with(changed))
-    return [folder / "old.onnx", folder / "new.onnx"]
 
 
 @pytest.mark.parametrize("name", ["kills", "kills_between_two_steps", "interrupts"])
