@@ -15,7 +15,6 @@ from qsgm.errors import QsgmError, as_text
 from qsgm.files import is_plain, new_folder, remove_folder
 from qsgm.grasp.task import NAME as GRASP
 from qsgm.grasp.tuned import (
-    DESCRIPTION,
     MARGIN_PX,
     MOST_VIEWS,
     ObjectDescription,
@@ -27,6 +26,7 @@ from qsgm.manifest import NETWORK
 from qsgm.samples.tuned import NetworkDescription, read_network, task_named_in
 from qsgm.tables import number
 from qsgm.task import heads_to_json
+from qsgm.tuned_folder import DESCRIPTION
 
 LONGEST_NAME = 200
 _LIBRARIES = ("qsgm", "onnxruntime", "opencv", "numpy")

@@ -21,7 +21,7 @@ FILES = {
 }
 # What knows no task: neither that of the bundle that ships nor another.
 NO_TASK = ["tune", "sgm", "bundle", "manifest", "network", "task", "schedule", "blocks"]
-NO_TASK += ["fidelity", "progress", "tables", "weights"]
+NO_TASK += ["fidelity", "progress", "tables", "weights", "tuned_folder"]
 HOST = ["model", "pretraining", "quantization", "graphs"]
 HOST += ["export", "slim", "checkpoint", "heads", "task"]
 

@@ -221,7 +221,7 @@ def finetune(
     from qsgm.files import check_replaceable
     from qsgm.grasp.report import finetune_report
     from qsgm.grasp.taught import finetune_json
-    from qsgm.grasp.tuned import DESCRIPTION
+    from qsgm.tuned_folder import DESCRIPTION
 
     tuned, first = tuned_layers(layers, blocks), frames[0]
     centers = parsed_centers(center, len(frames))

@@ -5,8 +5,6 @@ judged, and all that tells how the object was made. Folders of version 1 have no
 read as ever, and the network alone says where the object is.
 """
 
-import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import is_plain, new_folder, read_file, read_whole
+from qsgm.files import read_file, read_whole
 from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
@@ -34,11 +32,17 @@ from qsgm.grasp.shown import View
 from qsgm.images import check_frame
 from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
 from qsgm.runtime import Value, check_interface, open_session, running
+from qsgm.tuned_folder import (
+    COMMAND,
+    DESCRIPTION,
+    FORMAT,
+    VERSION,
+    sha256,
+    unaltered,
+    write_tuned,
+)
 
-FORMAT = "qsgm-object"
-VERSIONS = (1, 2)
-DESCRIPTION = "object.json"
-REPORT = "report.json"
+VERSIONS = (1, VERSION)
 PATCH = "patch.png"
 MOST_BYTES = 16_000_000  # of the network, of a patch
 MOST_VIEWS = 100
@@ -59,7 +63,6 @@ _LARGEST_SIDE_PX = 2048
 _APART_PX = 48.0
 _TAKES: dict[str, Value] = {"frame": ("tensor(uint8)", (None, None, 3))}
 _GIVES: dict[str, Value] = {"heatmap": ("tensor(float)", (3, None, None))}
-_COMMAND = "qsgm finetune -o DIR"
 _ADVICE = "tune the object again with `qsgm finetune`"
 _KEYS: dict[str, type] = {"name": str, "encoding": str, "offset_rad": float, "sha256": str}
 _NEW_KEYS: dict[str, type] = {"scale": float, "views": list, "made": dict}
@@ -285,14 +288,7 @@ def save_object(
         PATCH if number == 1 else f"patch_{number}.png": encode_patch(view.patch)
         for number, view in enumerate(description.views, start=1)
     }
-    head = {"format": FORMAT, "version": VERSIONS[-1], "sha256": _sha256(network)}
-    with new_folder(folder, DESCRIPTION) as new:
-        (new / NETWORK).write_bytes(network)
-        for name, data in patches.items():
-            (new / name).write_bytes(data)
-        values = head | _to_json(description, patches)
-        (new / DESCRIPTION).write_text(json.dumps(values, indent=1) + "\n")
-        (new / REPORT).write_text(json.dumps(report, indent=1) + "\n")
+    write_tuned(folder, network, _to_json(description, patches), report, patches)
 
 
 def load_object(folder: Path, threads: int = 1) -> TunedObject:
@@ -315,40 +311,26 @@ def read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
 
 def _read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
     path = folder / DESCRIPTION
-    data = read_file(path, MANIFEST_BYTES, f"an object written by `{_COMMAND}`")
-    manifest = parse_description(data, path, FORMAT, VERSIONS, _COMMAND)
+    data = read_file(path, MANIFEST_BYTES, f"an object written by `{COMMAND}`")
+    manifest = parse_description(data, path, FORMAT, VERSIONS, COMMAND)
     if "task" in manifest:
         raise QsgmError(
             f"{folder} is a tuned network of another task, no object to look for in a frame; pass "
             "`qsgm predict` its samples instead"
         )
     first = manifest["version"] == VERSIONS[0]
-    require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS), _COMMAND)
+    require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS), COMMAND)
     name, encoding, offset_rad = (manifest[key] for key in ("name", "encoding", "offset_rad"))
     if encoding not in ENCODINGS or not math.isfinite(offset_rad):
         raise QsgmError(
             f"{path}: expected encoding {' or '.join(ENCODINGS)} and a finite "
             f"offset_rad, got {encoding!r} and {offset_rad}; {_ADVICE}"
         )
-    network = _unaltered(folder, NETWORK, manifest["sha256"])
+    network = unaltered(folder, NETWORK, manifest["sha256"], MOST_BYTES, _ADVICE)
     description = ObjectDescription(as_text(name), encoding, offset_rad)
     if not first:
         description = _with_looks(description, folder, manifest)
     return description, network
-
-
-def _unaltered(folder: Path, name: object, sha256: object) -> bytes:
-    """A file of an object, if it is the one that the description means.
-
-    Raises:
-        QsgmError: it is missing, altered or elsewhere.
-    """
-    if not is_plain(name):
-        raise QsgmError(f"{folder / DESCRIPTION} names the file {name!r}, no plain name; {_ADVICE}")
-    data = read_file(folder / name, MOST_BYTES, f"a file that `{_COMMAND}` wrote")
-    if _sha256(data) != sha256:
-        raise QsgmError(f"{folder / name} is altered: its sha256 differs; {_ADVICE}")
-    return data
 
 
 def _to_json(about: ObjectDescription, patches: Mapping[str, bytes]) -> dict[str, Any]:
@@ -361,7 +343,7 @@ def _to_json(about: ObjectDescription, patches: Mapping[str, bytes]) -> dict[str
         "views": [
             {
                 "file": name,
-                "sha256": _sha256(data),
+                "sha256": sha256(data),
                 "center_px": list(view.patch.center_px),
                 "cut_out": view.patch.cut_out,
                 "turn_rad": view.turn_rad,
@@ -410,7 +392,7 @@ def _with_looks(
 
 
 def _view(folder: Path, entry: Mapping[str, Any]) -> View:
-    data = _unaltered(folder, entry["file"], entry["sha256"])
+    data = unaltered(folder, entry["file"], entry["sha256"], MOST_BYTES, _ADVICE)
     x, y = (float(value) for value in entry["center_px"])
     if not (0 <= x <= PATCH_PX and 0 <= y <= PATCH_PX):
         raise ValueError(f"`center_px` must lie in the patch, got {(x, y)}")
@@ -463,7 +445,3 @@ def _around(heatmap: NDArray[np.float32], cell: tuple[int, int]) -> NDArray[np.f
     alone[0] = 0
     alone[0][near] = heatmap[0][near]
     return alone
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

@@ -1,6 +1,5 @@
 """A tuned network: a folder with a stand-alone ONNX network, what it is for, and the report."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,19 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import new_folder, read_file, read_whole
+from qsgm.files import read_file, read_whole
 from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
 from qsgm.network import Network
 from qsgm.runtime import Value, check_interface, open_session, running
 from qsgm.samples.lesson import Samples, checked_samples
 from qsgm.task import Array, Inputs, TaskRecord, heads_from_json, heads_to_json, output_count
+from qsgm.tuned_folder import COMMAND, DESCRIPTION, FORMAT, VERSION, unaltered, write_tuned
 
-FORMAT = "qsgm-object"
-VERSION = 2
-DESCRIPTION = "object.json"
-REPORT = "report.json"
 MOST_BYTES = 256_000_000
-_COMMAND = "qsgm finetune -o DIR"
 _ADVICE = "tune it again with `qsgm finetune`"
 
 
@@ -76,20 +71,13 @@ def save_network(
 ) -> None:
     """Write a tuned network; it appears complete or not at all. Raises QsgmError."""
     description = {
-        "format": FORMAT,
-        "version": VERSION,
         "name": name,
         "task": {"name": task.name, **task.settings},
         "network": task.network.to_json(),
         "heads": heads_to_json(task.heads),
-        "sha256": hashlib.sha256(network).hexdigest(),
         "made": dict(made),
     }
-    with new_folder(folder, DESCRIPTION) as new:
-        (new / NETWORK).write_bytes(network)
-        for file, values in ((DESCRIPTION, description), (REPORT, report)):
-            text = json.dumps(values, indent=1, allow_nan=False)
-            (new / file).write_text(text + "\n", encoding="utf-8")
+    write_tuned(folder, network, description, report)
 
 
 def task_named_in(folder: Path) -> str | None:
@@ -123,22 +111,18 @@ def read_network(folder: Path) -> tuple[NetworkDescription, bytes]:
 def _read(folder: Path) -> tuple[NetworkDescription, bytes]:
     path = folder / DESCRIPTION
     data = read_file(path, MANIFEST_BYTES, "a tuned network")
-    values = parse_description(data, path, FORMAT, (VERSION,), _COMMAND)
+    values = parse_description(data, path, FORMAT, (VERSION,), COMMAND)
     keys = {"name": str, "task": dict, "network": dict, "heads": list, "sha256": str}
-    require_keys(path, values, keys, _COMMAND)
+    require_keys(path, values, keys, COMMAND)
     settings = dict(values["task"])
-    require_keys(path, settings, {"name": str}, _COMMAND)
+    require_keys(path, settings, {"name": str}, COMMAND)
     try:
         network, heads = Network.from_json(values["network"]), heads_from_json(values["heads"])
         if output_count(heads) != network.outputs:
             raise QsgmError("the heads are not the network's")
     except QsgmError as error:
         raise QsgmError(f"{path}: {error}; {_ADVICE}") from error
-    content = read_file(folder / NETWORK, MOST_BYTES, "a tuned network's graph")
-    if hashlib.sha256(content).hexdigest() != values["sha256"]:
-        raise QsgmError(
-            f"{folder / NETWORK} is not the file it was (its sha256 differs); {_ADVICE}"
-        )
+    content = unaltered(folder, NETWORK, values["sha256"], MOST_BYTES, _ADVICE)
     task = TaskRecord(as_text(settings.pop("name")), network, heads, settings)
     made = values.get("made")
     known = made if isinstance(made, dict) else {}

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from toys import bump, by_correlation, lay, table, toy
 
-from qsgm import QsgmError, load_object
+from qsgm import QsgmError, load_object, tuned_folder
 from qsgm.bundle import Bundle
 from qsgm.grasp import tuned as tuned_module
 from qsgm.grasp.decision import Decision
@@ -22,14 +22,13 @@ from qsgm.grasp.heatmap import Detection, Place, locate, refine
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import (
-    DESCRIPTION,
     MARGIN_PX,
-    REPORT,
     ObjectDescription,
     TunedObject,
     save_object,
 )
 from qsgm.manifest import NETWORK
+from qsgm.tuned_folder import DESCRIPTION, REPORT
 
 Point = tuple[float, float]
 MUG = ObjectDescription("mug", "double", 0.25)
@@ -547,7 +546,8 @@ def test_an_object_that_is_replaced_while_it_is_read_is_the_old_or_the_new(
             save_object(folder, named("new"), networks[1], {})
         return data
 
-    monkeypatch.setattr(tuned_module, "read_file", replacing)
+    for module in (tuned_module, tuned_folder):
+        monkeypatch.setattr(module, "read_file", replacing)
     for moment in range(1, 4):
         save_object(folder, named("old"), networks[0], {})
         reads = 0

@@ -22,7 +22,7 @@ import numpy as np
 
 from qsgm import QsgmError, files, load_bundle, load_object, paths, read_frame
 from qsgm.grasp.task import distractors_of, task_of
-from qsgm.grasp.tuned import DESCRIPTION
+from qsgm.tuned_folder import DESCRIPTION
 
 ADDRESS_SPACE = 8 * 2**30  # what numpy, OpenCV and torch reserve without using it is part of it
 MOST_GROWTH_KB = 700_000  # of the largest size in memory, from one end of a campaign to the other

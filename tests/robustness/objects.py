@@ -18,7 +18,7 @@ from pathlib import Path
 
 from qsgm import QsgmError, files, load_object, paths
 from qsgm.files import write_bytes_atomic
-from qsgm.grasp.store import graph_of, remove_object, rename_object
+from qsgm.store import graph_of, remove_object, rename_object
 from robustness import file_events
 from robustness.saves import ended_at, save, stride_of
 
