@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from qsgm.images import read_frame
     from qsgm.network import Layer, Network, conv
     from qsgm.samples.lesson import Samples
-    from qsgm.samples.task import SampleTask
+    from qsgm.samples.task import RecordedTask, SampleTask
     from qsgm.samples.taskfile import load_task
     from qsgm.samples.teach import learn
     from qsgm.samples.tuned import TunedNetwork, load_network
@@ -66,6 +66,7 @@ else:
         "Plan": "qsgm.tune.plan",
         "Prepared": "qsgm.tune.prepare",
         "Probe": "qsgm.tune.probe",
+        "RecordedTask": "qsgm.samples.task",
         "Result": "qsgm.tune.result",
         "SampleTask": "qsgm.samples.task",
         "Samples": "qsgm.samples.lesson",
@@ -113,6 +114,7 @@ __all__ = [
     "Prepared",
     "Probe",
     "QsgmError",
+    "RecordedTask",
     "Result",
     "SampleTask",
     "Samples",

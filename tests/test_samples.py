@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qsgm import Head, Network, QsgmError, Samples, SampleTask, conv, load_task
+from qsgm import (
+    Head,
+    Network,
+    QsgmError,
+    RecordedTask,
+    Samples,
+    SampleTask,
+    conv,
+    load_task,
+)
 from qsgm.samples.arrays import NAME, ArraysTask, read_npz
 from qsgm.samples.lesson import head_scores, lesson_of
 from qsgm.samples.taskfile import read_samples, task_for
@@ -20,6 +29,7 @@ from qsgm.task import TaskRecord, task_record
 NETWORK = Network((2, 3, 1), (conv(1, 4, (2, 3)), conv(4, 3, relu=False)), "numbers")
 HEADS = (Head("kind", "cross_entropy", 3, "softmax"),)
 TASK = ArraysTask(NAME, NETWORK, HEADS)
+RNG = np.random.default_rng(0)
 FILE = """
 from qsgm import Head, Network, SampleTask, conv
 task = SampleTask(
@@ -229,3 +239,39 @@ def test_a_pool_of_arrays_is_drawn_group_by_group(tmp_path: Path) -> None:
     assert all(any(set(one.ravel()) <= half for half in halves) for one in drawn)
     path.write_text("{}")
     assert "is no task `arrays`" in refused(lambda: load_arrays_task(path))
+
+
+def test_of_recordings_the_ends_are_held_out_and_no_window_reaches_from_one_part_to_another() -> (
+    None
+):
+    task = RecordedTask("mine", NETWORK, HEADS, overlap=2)
+    lengths = (10, 23)
+    numbered = [100 * i + np.arange(count) for i, count in enumerate(lengths)]
+    shown = [
+        Samples(np.zeros((len(one), 2, 3, 1), np.float32) + one[:, None, None, None], labels(one))
+        for one in numbered
+    ]
+    lesson = task.lesson(shown, np.random.default_rng(0))
+    seen = lesson.inputs[:, 0, 0, 0]
+    assert seen[lesson.taught :].tolist() == [8, 9, *range(118, 123)]
+    assert seen[: lesson.taught].tolist() == [*range(6), *range(100, 116)]
+    np.testing.assert_array_equal(lesson.labels, labels(seen))
+
+
+def test_a_recording_without_labels_or_of_too_few_windows_is_refused_in_one_line() -> None:
+    task = RecordedTask("mine", NETWORK, HEADS, overlap=2)
+    few, enough = (Samples(inputs(count), labels(np.arange(count))) for count in (3, 4))
+    assert task.lesson([enough], np.random.default_rng(0)).taught == 1
+    assert "has 3 windows, expected 4" in refused(lambda: task.lesson([enough, few], RNG))
+    unlabelled = Samples(enough.inputs)
+    assert "has no labels" in refused(lambda: task.lesson([enough, unlabelled], RNG))
+    assert "nothing was shown" in refused(lambda: task.lesson([], RNG))
+
+
+def labels(numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.eye(3, dtype=np.float32)[numbers.astype(int) % 3]
+
+
+def test_a_single_number_in_an_archive_stays_one(tmp_path: Path) -> None:
+    found = read_npz(saved(tmp_path / "a.npz", arm=1, kinds=np.arange(3)), ("arm", "kinds"))
+    assert (found["arm"].shape, int(found["arm"]), found["kinds"].shape) == ((), 1, (3,))

@@ -108,4 +108,4 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
         raise ValueError(f"{entry.filename} has other numbers than {shape}")
     array = np.frombuffer(data, dtype)
     shaped = array.reshape(shape, order="F" if fortran else "C")
-    return np.ascontiguousarray(shaped, dtype.newbyteorder("="))
+    return np.asarray(shaped, dtype.newbyteorder("="), order="C")  # a single number stays one

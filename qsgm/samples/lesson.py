@@ -75,6 +75,35 @@ def lesson_of(task: Task, shown: Sequence[Samples], rng: np.random.Generator) ->
     return SampleLesson(task, inputs, np.concatenate(labels)[order], total - held_out)
 
 
+def ends_held_out(task: Task, shown: Sequence[Samples], overlap: int) -> SampleLesson:
+    """Windows of recordings, the last fifth of each held out.
+
+    Args:
+        task: whose samples they are.
+        shown: each a recording's windows, in their order.
+        overlap: how many in front of those held out take no part, as they reach into them.
+
+    Raises:
+        QsgmError: there is no recording, or one has too few windows or no labels.
+    """
+    if not shown:
+        raise QsgmError("nothing was shown to learn from; pass labelled recordings")
+    taught, held_out = list[Samples](), list[Samples]()
+    for one in shown:
+        end = len(one) - max(1, round(HELD_OUT_SHARE * len(one)))
+        if one.labels is None or end <= overlap:
+            has = "no labels" if one.labels is None else f"{len(one)} windows"
+            raise QsgmError(
+                f"a recording to learn from has {has}, expected {overlap + 2} labelled ones"
+            )
+        taught.append(Samples(one.inputs[: end - overlap], one.labels[: end - overlap]))
+        held_out.append(Samples(one.inputs[end:], one.labels[end:]))
+    parts = [*taught, *held_out]
+    inputs = np.concatenate([one.inputs for one in parts])
+    labels = np.concatenate([one.labels for one in parts if one.labels is not None])
+    return SampleLesson(task, inputs, labels, sum(map(len, taught)))
+
+
 def head_scores(heads: Sequence[Head], outputs: Array, labels: Array) -> Scores:
     """By head: the share of right answers, or the mean absolute error where it gives numbers.
 

@@ -18,7 +18,13 @@ import numpy as np
 
 from qsgm.errors import QsgmError
 from qsgm.network import Network
-from qsgm.samples.lesson import SampleLesson, Samples, head_scores, lesson_of
+from qsgm.samples.lesson import (
+    SampleLesson,
+    Samples,
+    ends_held_out,
+    head_scores,
+    lesson_of,
+)
 from qsgm.task import Array, Heads, Scores, output_count
 
 TUNED = 2
@@ -70,3 +76,18 @@ class SampleTask:
     def example(self, rng: np.random.Generator, count: int) -> Samples:
         """Labelled samples that the network is pretrained on (host only): what is drawn."""
         return self.draw(rng, count)
+
+
+@dataclass(frozen=True)
+class RecordedTask(SampleTask):
+    """A task whose files are recordings, and its samples windows of these, in their order.
+
+    At random, every window held out would overlap some that are learnt from; so the end of each
+    recording is.
+    """
+
+    overlap: int = 0  # how many windows in front of another one reach into it
+
+    def lesson(self, shown: Sequence[Samples], rng: np.random.Generator) -> SampleLesson:  # noqa: ARG002
+        """What is learnt of the recordings shown; the last fifth of each is held out."""
+        return ends_held_out(self, shown, self.overlap)
