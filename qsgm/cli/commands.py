@@ -175,12 +175,19 @@ def slim(
     blocks: Annotated[
         str, typer.Option(metavar="A-B,C", help="The one way of tuning that stays.")
     ] = defaults.SLIM_BLOCKS,
+    without_scan: Annotated[
+        bool,
+        typer.Option(
+            "--without-scan", help="All crops at once, for runtimes that lack ONNX's Scan."
+        ),
+    ] = False,
     bundle: BundleOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a small bundle of a whole one: what one way of tuning takes (host; needs onnx)."""
     host = host_module("qsgm.train.slim")
-    report = host.slim_bundle(open_bundle(bundle), parsed_blocks(blocks), output)
+    whole, kept = open_bundle(bundle), parsed_blocks(blocks)
+    report = host.slim_bundle(whole, kept, output, without_scan=without_scan)
     show(report.to_json(), report, as_json)
 
 

@@ -37,13 +37,12 @@ from qsgm.manifest import (
 )
 from qsgm.network import Network
 from qsgm.progress import Progress
-from qsgm.schedule import BATCH
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
 from qsgm.train.graphs.inspection import refuse_float_products
-from qsgm.train.graphs.memory import graph_memory
+from qsgm.train.graphs.memory import with_peaks
 from qsgm.train.graphs.optimizers import OPTIMIZERS, Optimizer
 from qsgm.train.graphs.probe import head_model, probe_model
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm
@@ -134,25 +133,20 @@ def export_bundle(
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
-        manifest = with_peaks(Bundle(new, manifest), exported, watch)
+        steps = steps_of(trainee.network, most, exported)
+        manifest = with_peaks(Bundle(new, manifest), steps, watch)
         (new / MANIFEST).write_text(manifest.text(), encoding="utf-8")
     return report
 
 
-def with_peaks(bundle: Bundle, blocks: Sequence[Blocks], watch: Progress) -> Manifest:
-    """The manifest, saying how many bytes of activations each training step holds at once."""
-    manifest, files = bundle.manifest, dict(bundle.manifest.files)
-    steps = {
+def steps_of(network: Network, most_layers: int, blocks: Sequence[Blocks]) -> dict[str, Blocks]:
+    """Every training step's file, and its blocks."""
+    return {
         step_file(precision, optimizer, one): one
-        for one in every_block(bundle.network, manifest.most_layers, blocks)
+        for one in every_block(network, most_layers, blocks)
         for precision in PRECISIONS
         for optimizer in optimizers_of(one)
     }
-    for done, (name, one) in enumerate(steps.items(), start=1):
-        peak = graph_memory(bundle, name, one, BATCH).peak
-        files[name] = replace(files[name], peak_activation_bytes=peak)
-        watch("memory", done, len(steps))
-    return replace(manifest, files=files)
 
 
 def every_block(network: Network, most_layers: int, blocks: Sequence[Blocks]) -> list[Blocks]:

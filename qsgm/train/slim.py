@@ -2,8 +2,9 @@
 
 What stays is what `qsgm finetune` opens for these blocks with the bundle's own optimizers and its
 own precision of the frozen layers: the step with SGMs in int8 and in float, backpropagation, and
-the probe, by which a run says how faithful its gradients are. No number changes. `qsgm bench` of
-speed, memory, resources and growth compares steps that only a whole bundle has.
+the probe, by which a run says how faithful its gradients are. No number changes, unless loops are
+taken out. `qsgm bench` of speed, memory, resources and growth compares steps that only a whole
+bundle has.
 """
 
 import hashlib
@@ -31,6 +32,9 @@ from qsgm.manifest import (
     step_file,
     trunk_file,
 )
+from qsgm.progress import ignore
+from qsgm.train.graphs.loops import has_loops, without_loops
+from qsgm.train.graphs.memory import with_peaks
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm, whole_model
 from qsgm.train.graphs.short_names import shorten
 
@@ -61,13 +65,16 @@ class SlimReport:
         return f"{self.output}: {len(self.bytes)} files, {self.total_bytes / 1000:.0f} KB"
 
 
-def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
+def slim_bundle(
+    bundle: Bundle, blocks: Blocks, output: Path, *, without_scan: bool = False
+) -> SlimReport:
     """Write what tuning these blocks takes as a bundle of its own.
 
     Args:
         bundle: a whole one.
         blocks: which it has steps for.
         output: absent, empty, or an earlier bundle.
+        without_scan: steps take all crops at once, which other runtimes run, and more memory.
 
     Raises:
         QsgmError: the bundle lacks the blocks, or the output folder is the bundle's own or holds
@@ -85,6 +92,9 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
     graphs = {
         name: whole_model(bundle.read(name), bundle.read) for name in kept_graphs(bundle, blocks)
     }
+    looping = [name for name, graph in graphs.items() if without_scan and has_loops(graph)]
+    for name in looping:
+        without_loops(graphs[name])
     shared = SharedConstants(WEIGHTS, constants_elsewhere(NETWORK, network))
     sgms = {
         layer: shared_sgm(shared, bundle.float_sgm(layer), bundle.activation_bits(layer))
@@ -97,11 +107,13 @@ def slim_bundle(bundle: Bundle, blocks: Blocks, output: Path) -> SlimReport:
     files |= {NETWORK: network, WEIGHTS: shared.data, **task_files(bundle)}
     entries = {name: kept_entry(bundle, name, data) for name, data in files.items()}
     manifest = replace(kept_manifest(bundle.manifest, blocks), sgms=sgms, files=entries)
-    text = json.dumps(manifest.to_json(), sort_keys=True, separators=(",", ":"))
-    files[MANIFEST] = text.encode()
     with new_folder(output, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
+        manifest = with_peaks(Bundle(new, manifest), dict.fromkeys(looping, blocks), ignore)
+        text = json.dumps(manifest.to_json(), sort_keys=True, separators=(",", ":"))
+        files[MANIFEST] = text.encode()
+        (new / MANIFEST).write_bytes(files[MANIFEST])
     sizes = {name: len(data) for name, data in sorted(files.items())}
     return SlimReport(str(output), str(blocks), sizes)
 

@@ -111,7 +111,7 @@ def test_a_small_graph_needs_what_one_can_work_out_and_the_runtime_says_the_same
     op = graph.within("some")
     wide = op.MatMul(x, op.constant(np.ones((64, 256))))  # (n, 256)
     folded = op.Reshape(wide, op.shape(-1, 128))  # (2 n, 128)
-    narrow = op.ReduceMean(folded, axes=[1], keepdims=1)  # (2 n, 1)
+    narrow = op.ReduceMean(folded, op.shape(1), keepdims=1)  # (2 n, 1)
     graph.output("y", op.Sub(folded, narrow), np.float32, ("m", 128))
     path = tmp_path / "small.onnx"
     onnx.save(graph.model(), path)

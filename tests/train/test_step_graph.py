@@ -121,7 +121,7 @@ def test_inputs_and_outputs_have_their_names(net: FoldedNet) -> None:
     assert {value.name for value in model.graph.input} == {*state, *others}
     results = {value.name for value in model.graph.output}
     assert results == {"loss", *(f"{name}_next" for name in state)}
-    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
+    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 19)]
 
 
 def test_a_missing_sgm_is_refused(net: FoldedNet) -> None:

@@ -8,6 +8,7 @@ sgm         a static SGM in float and in int8
 optimizers  SGD with momentum and Adam, one parameter at a time
 step        a whole training step, block by block; one block is backpropagation
 probe       the gradients that an SGM should give, and gives in float and int8; bare outputs
+loops       a step without loops, for runtimes that have none
 memory      activations of a step alive at once
 inspection  which operators ONNX Runtime makes of a graph
 sharing     constants of all graphs in one file

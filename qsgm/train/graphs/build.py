@@ -7,7 +7,7 @@
     model = graph.model()
 
 A value is known by its name, a plain string. Opset and IR version are old enough for every
-runtime since 2022, and the default domain is the only one.
+runtime since 2023, and the default domain is the only one.
 
 The body of a loop is a graph in another one. It sees that one's inputs, and keeps its constants
 there.
@@ -22,8 +22,9 @@ import onnx
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from onnx import helper, numpy_helper
 
-OPSET = 17
-IR_VERSION = 8
+# The oldest in which onnx's reference evaluator dequantizes.
+OPSET = 19
+IR_VERSION = 9
 
 Value = str
 Dimension = int | str  # a number, or the name of a size that is free

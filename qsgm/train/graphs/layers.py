@@ -28,6 +28,7 @@ from qsgm.train.model.arrays import PIXEL_OFFSET, PIXEL_SCALE, CurvatureArrays, 
 MANY_WINDOWS = 100
 # Times the smallest normal float32 this is above 1.
 STEEP = 1e38
+ALMOST_ZERO = 1e-30
 
 FloatArray = NDArray[np.float32]
 
@@ -205,7 +206,7 @@ def forward(op: Ops, layer: TunedLayer, x: Value) -> Pass:
         return Pass(seen, active, active)
     maps = as_maps(op, layer, active)
     if layer.network.pools_all(layer.number):
-        return Pass(seen, active, op.ReduceMean(maps, axes=[1], keepdims=0))
+        return Pass(seen, active, op.ReduceMean(maps, op.shape(1), keepdims=0))
     pooled = op.MatMul(op.constant(pool_shares(layer)), maps)
     return Pass(seen, active, op.Reshape(pooled, op.shape(-1, layer.layer.out)))
 
@@ -251,9 +252,10 @@ def is_positive(op: Ops, x: Value) -> Value:
     """1 where a number is above zero, else 0, in float32.
 
     Nothing lies between in a sigmoid so steep. It takes one node where Greater and Cast take two;
-    Where in the place of Cast and a product takes three times as long.
+    Where in the place of Cast and a product takes three times as long. OpenVINO reads a beta of 0
+    as the default, 0.5: so it is a number that adds nothing.
     """
-    return op.HardSigmoid(x, alpha=STEEP, beta=0.0)
+    return op.HardSigmoid(x, alpha=STEEP, beta=-ALMOST_ZERO)
 
 
 def summed_gradients(op: Ops, done: Pass, dz: Value) -> Gradients:

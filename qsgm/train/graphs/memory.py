@@ -28,8 +28,10 @@ from onnx import helper
 
 from qsgm.blocks import Blocks
 from qsgm.bundle import Bundle
-from qsgm.manifest import Precision, step_file
+from qsgm.manifest import Manifest, Precision, step_file
+from qsgm.progress import Progress
 from qsgm.runtime import session_options
+from qsgm.schedule import BATCH
 from qsgm.train.graphs.inspection import all_nodes, bodies
 from qsgm.tune.graphs import running_graphs
 from qsgm.tune.noop_step import noop_step, start_of
@@ -125,6 +127,19 @@ def graph_memory(
         None if asked is None else asked[0],
         None if asked is None else asked[-1],
     )
+
+
+def with_peaks(bundle: Bundle, steps: Mapping[str, Blocks], watch: Progress) -> Manifest:
+    """A bundle's manifest, saying how many bytes of activations each training step holds at once.
+
+    `steps` are files and their blocks. Raises QsgmError as :func:`graph_memory`.
+    """
+    files = dict(bundle.manifest.files)
+    for done, (name, blocks) in enumerate(steps.items(), start=1):
+        peak = graph_memory(bundle, name, blocks, BATCH).peak
+        files[name] = replace(files[name], peak_activation_bytes=peak)
+        watch("memory", done, len(steps))
+    return replace(bundle.manifest, files=files)
 
 
 def traced(model: Path, use: Callable[[ort.InferenceSession], object], threads: int = 1) -> Trace:

@@ -10,7 +10,7 @@ Outputs: every state under its name with `_next`; `loss`, the batch's mean befor
 from collections.abc import Mapping
 
 import numpy as np
-from onnx import ModelProto
+from onnx import ModelProto, numpy_helper
 
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
@@ -139,8 +139,11 @@ def block_by_crops(
     label = body.input(f"label{first.number}", np.float32, (first.network.outputs,))
     add_crop(body, block, sgm, sums, crop, label)
     op = graph.within(f"layer{last.number}")
+    zero = numpy_helper.from_array(np.zeros(1, np.float32))  # tract has another default
     nothing = [
-        op.ConstantOfShape(op.shape(*shape)) for layer in block for shape in gradient_shapes(layer)
+        op.ConstantOfShape(op.shape(*shape), value=zero)
+        for layer in block
+        for shape in gradient_shapes(layer)
     ]
     crops = op.Reshape(x, op.shape(-1, *maps)) if first.features is None else x
     found, (after,) = op.one_by_one(body, nothing, [crops, batch.labels])
@@ -175,7 +178,7 @@ def add_crop(
     last = block[-1]
     op = body.within(f"layer{last.number}")
     passes = forward_all(body, block, crop)
-    labels = op.Reshape(label, op.shape(1, last.network.outputs))
+    labels = op.Reshape(label, op.shape(-1, last.network.outputs))
     gradient = sgm_gradient(op, sgm, passes[-1].after, labels, last.network.outputs)
     found = carried_back(body, block, passes, gradient)
     for layer, so_far, one in zip(block, sums, found, strict=True):
