@@ -1,6 +1,6 @@
 /** What lies on crops beside the object: drawn things, other surfaces, other light. */
 
-import { boxBlur, halfToEven, inverted, picture, times255, warp } from "./pixels.js";
+import { boxBlur, halfToEven, picture, times255, warp } from "./pixels.js";
 
 export const CROP_PX = 128;
 export const HALF_PX = 64;
@@ -138,8 +138,8 @@ export function addClutter(crop, plan, row, sprites) {
 
 function pasteThing(crop, plan, row, sprites) {
   const { tile, reach } = sprites[plan.sprite[row]];
-  const cos = plan.scale[row] * Math.cos(plan.turn[row]);
-  const sin = plan.scale[row] * Math.sin(plan.turn[row]);
+  const [scale, turn] = [plan.scale[row], plan.turn[row]];
+  const [cos, sin] = [scale * Math.cos(turn), scale * Math.sin(turn)];
   const [x, y] = plan.center.subarray(2 * row, 2 * row + 2);
   const halfX = Math.abs(cos) * reach[0] + Math.abs(sin) * reach[1] + 1;
   const halfY = Math.abs(sin) * reach[0] + Math.abs(cos) * reach[1] + 1;
@@ -147,12 +147,12 @@ function pasteThing(crop, plan, row, sprites) {
     (side, i) => (i < 2 ? Math.floor(side) : Math.ceil(side)),
   ));
   if (box[0] >= box[2] || box[1] >= box[3]) return;
-  const middle = (TILE_PX - 1) / 2;
-  const shiftX = x - box[0] - (cos + sin) * middle;
-  const shiftY = y - box[1] - (cos - sin) * middle;
+  const [kCos, kSin] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
+  const [u, v, middle] = [x - box[0], y - box[1], (TILE_PX - 1) / 2];
+  const toTile = [kCos, -kSin, middle - kCos * u + kSin * v, kSin, kCos, middle - kSin * u - kCos * v];
   const layer = picture(box[2] - box[0], box[3] - box[1], 4);
   const lit = gained(tile, reach, plan.gain.subarray(3 * row, 3 * row + 3));
-  warp(lit, layer, inverted([cos, sin, shiftX, -sin, cos, shiftY]), false);
+  warp(lit, layer, toTile, false);
   blend(crop, layer, box, plan.shadow.subarray(4 * row, 4 * row + 4));
 }
 

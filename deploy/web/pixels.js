@@ -1,8 +1,8 @@
 /**
- * Arithmetic on pictures, to the bit as OpenCV 5 has it.
+ * Arithmetic on pictures, to the bit as docs/bundle.md has it.
  *
  * A picture is {data, width, height, channels}, bytes row by row. A `Uint8ClampedArray` rounds half
- * to even and saturates when a number is stored in it, as OpenCV does; fused multiply-adds are sums
+ * to even and saturates when a number is stored in it, as is wanted; fused multiply-adds are sums
  * in doubles, rounded once.
  */
 
@@ -31,27 +31,23 @@ function mirrored(i, n) {
 }
 
 /**
- * warpAffine with bilinear interpolation of a picture of four channels, of which all are made.
+ * warpAffine with bilinear interpolation of a picture of four channels; a mirrored one is a frame,
+ * whose fourth channel is 255 throughout.
  *
  * `matrix` (6) maps pixels of `to` to pixels of `from`. What lies outside is the mirrored picture,
- * or nothing where `mirror` is false. Coordinates are in single precision; what is left of a row
- * behind whole groups of 16 pixels adds them up in another order.
+ * or nothing where `mirror` is false. Coordinates are in single precision.
  */
 export function warp(from, to, matrix, mirror) {
   const { data, width, height } = from;
   const out = to.data;
   const m = Float32Array.from(matrix);
   const at = new Int32Array(4);
-  const grouped = to.width - (to.width % 16);
   for (let y = 0, o = 0; y < to.height; y++) {
-    const downX = f32(m[1] * y);
-    const downY = f32(m[4] * y);
-    const startX = f32(downX + m[2]);
-    const startY = f32(downY + m[5]);
+    const startX = f32(f32(m[1] * y) + m[2]);
+    const startY = f32(f32(m[4] * y) + m[5]);
     for (let x = 0; x < to.width; x++, o += 4) {
-      const whole = x < grouped;
-      const fromX = f32(whole ? m[0] * x + startX : f32(m[0] * x + downX) + m[2]);
-      const fromY = f32(whole ? m[3] * x + startY : f32(m[3] * x + downY) + m[5]);
+      const fromX = f32(m[0] * x + startX);
+      const fromY = f32(m[3] * x + startY);
       const left = Math.floor(fromX);
       const top = Math.floor(fromY);
       const a = fromX - left;
@@ -59,22 +55,25 @@ export function warp(from, to, matrix, mirror) {
       if (left >= 0 && top >= 0 && left < width - 1 && top < height - 1) {
         const p = (top * width + left) * 4;
         const q = p + 4 * width;
-        for (let c = 0; c < 4; c++) {
-          const upper = f32(data[p + c] + a * (data[p + 4 + c] - data[p + c]));
-          const lower = f32(data[q + c] + a * (data[q + 4 + c] - data[q + c]));
-          out[o + c] = f32(upper + b * f32(lower - upper));
-        }
+        out[o] = between(data[p], data[p + 4], data[q], data[q + 4], a, b);
+        out[o + 1] = between(data[p + 1], data[p + 5], data[q + 1], data[q + 5], a, b);
+        out[o + 2] = between(data[p + 2], data[p + 6], data[q + 2], data[q + 6], a, b);
+        out[o + 3] = mirror ? 255 : between(data[p + 3], data[p + 7], data[q + 3], data[q + 7], a, b);
       } else {
         corners(at, left, top, width, height, mirror);
         for (let c = 0; c < 4; c++) {
           const [p, q, r, s] = [...at].map((i) => (i < 0 ? 0 : data[i + c]));
-          const upper = f32(p + a * (q - p));
-          const lower = f32(r + a * (s - r));
-          out[o + c] = f32(upper + b * f32(lower - upper));
+          out[o + c] = between(p, q, r, s, a, b);
         }
       }
     }
   }
+}
+
+function between(p00, p01, p10, p11, a, b) {
+  const upper = f32(p00 + a * (p01 - p00));
+  const lower = f32(p10 + a * (p11 - p10));
+  return f32(upper + b * f32(lower - upper));
 }
 
 /** Where the four pixels around a point lie, -1 outside unless it is mirrored. */
@@ -87,15 +86,8 @@ function corners(at, left, top, width, height, mirror) {
   }
 }
 
-/** The inverse of an affine map (6). */
-export function inverted([a, b, x, c, d, y]) {
-  const determinant = 1 / (a * d - b * c);
-  const [p, q, r, s] = [d * determinant, -b * determinant, -c * determinant, a * determinant];
-  return [p, q, -p * x - q * y, r, s, -r * x - s * y];
-}
-
 /**
- * `cv2.transform` of BGR pixels: `color` (12 float32 from `at`) in fixed point with 10 bits.
+ * An affine map of BGR pixels: `color` (12 float32 from `at`) in fixed point with 10 bits.
  *
  * From four channels into three, packed, from byte `start` of `out`.
  */

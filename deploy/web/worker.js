@@ -13,7 +13,7 @@ const LEAST_SPAN_PX = 45;
 const LARGEST_SPAN_PX = 124;
 const IDEAL_SPAN_PX = 90;
 const LEAST_SIDE_PX = 256;
-const THUMBNAILS = 24;
+const THUMBNAILS = 24; // three of each of the first slices of 8 crops
 
 let bundle = null;
 let object = null; // about, network, session
@@ -82,9 +82,8 @@ const jobs = {
       throw new Error("The object fills its picture: step back until it takes up a third of it.");
     }
     const watch = async ({ samples, plan, ...event }) => {
-      if (event.kind === "crops" && event.first < 3 * THUMBNAILS) {
-        const shown = [0, 3, 6].filter((i) => i < 8);
-        event.thumbnails = shown.map((i) => ({
+      if (event.kind === "crops" && event.first < (8 * THUMBNAILS) / 3) {
+        event.thumbnails = [0, 1, 2].map((i) => ({
           pixels: thumbnail(samples, i), object: plan.quality[event.first + i] > 0,
         }));
       }
@@ -147,3 +146,4 @@ addEventListener("message", ({ data: { id, job, input } }) => {
     }
   });
 });
+postMessage({});
