@@ -73,7 +73,12 @@ export async function prepare(ort, bundle, frame, center, seed, tell) {
     await tell({ kind: "crops", done: first + SLICE, of: CROPS, samples, first, plan });
   }
   await trunk.release();
-  const lesson = { plan, features, dims, type: features instanceof Uint8Array ? "uint8" : "float32", seconds };
+  return { ...(await lessonOf(ort, bundle, plan, { data: features, dims })), seconds };
+}
+
+/** Planned crops by their features: how the object lies, labels, scores. */
+export async function lessonOf(ort, bundle, plan, { data, dims }) {
+  const lesson = { plan, dims, features: data, type: data instanceof Uint8Array ? "uint8" : "float32" };
   const head = await openGraph(ort, bundle, bundle.names.head);
   lesson.outputs = await outputsOf(ort, head, lesson, startWeights(bundle), 0, CROPS);
   await head.release();

@@ -21,8 +21,10 @@ export async function objectFiles(about, network) {
     format: FORMAT, version: 2, sha256: await sha256(network), ...about, views: [], decision: null,
     threshold: { quality: FOUND_FROM, false_alarm_rate: null },
   };
-  const text = new TextEncoder().encode(`${JSON.stringify(description, null, 1)}\n`);
-  return { "object.json": text, "network.onnx": network };
+  // Readers may tell 1 from 1.0, which JSON in JavaScript does not.
+  const json = JSON.stringify(description, null, 1)
+    .replace(/^( "(?:scale|offset_rad)": -?\d+)(?=,?$)/gm, "$1.0");
+  return { "object.json": new TextEncoder().encode(`${json}\n`), "network.onnx": network };
 }
 
 /** An object's files in a folder of its name, as a zip (a Blob). */

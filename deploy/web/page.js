@@ -234,6 +234,7 @@ $("save").addEventListener("click", doing(async () => {
   link.download = "object.zip";
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  say(`Saved: ${link.download}.`);
 }));
 $("open").addEventListener("change", doing(async () => {
   const files = {};

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -32,17 +33,14 @@ class Page:
         assert program is not None, "look for it first"
         to_browser, from_us = os.pipe()
         from_browser, to_us = os.pipe()
-
-        def as_three_and_four() -> None:
-            os.dup2(to_browser, 3)
-            os.dup2(to_us, 4)
-
+        # It reads from descriptor 3 and writes to 4.
+        shell = f'exec "$0" "$@" 3<&{to_browser} 4>&{to_us}'
+        profile_flag = f"--user-data-dir={profile}"
         self._process = subprocess.Popen(
-            [program, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+            ["/bin/bash", "-c", shell, program, *FLAGS, profile_flag, "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            pass_fds=(3, 4, to_browser, to_us),
-            preexec_fn=as_three_and_four,
+            pass_fds=(to_browser, to_us),
         )
         os.close(to_browser)
         os.close(to_us)
@@ -125,15 +123,17 @@ class Page:
         assert "exceptionDetails" not in got, (script, got["exceptionDetails"])
         return got["result"].get("value")
 
-    def until(self, script: str, every_s: float = 0.2) -> Any:
+    def until(self, script: str) -> None:
         """Wait until an expression is true."""
+        self.until_true(lambda: bool(self.run(script)), script)
+
+    def until_true(self, found: Callable[[], bool], what: str = "") -> None:
+        """Wait until something is so, unless a script fails before."""
         ends = time.monotonic() + PATIENCE_S
-        while time.monotonic() < ends:
-            if value := self.run(script):
-                return value
+        while not found():
             assert not self.problems, self.problems
-            time.sleep(every_s)
-        raise AssertionError(f"not within {PATIENCE_S:g} s: {script}")
+            assert time.monotonic() < ends, f"not within {PATIENCE_S:g} s: {what}"
+            time.sleep(0.2)
 
     def choose(self, selector: str, *files: Path) -> None:
         """Choose files in an input."""
@@ -147,4 +147,3 @@ class Page:
         clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
         got = self("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
         path.write_bytes(base64.b64decode(got["data"]))
-
