@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ FLAGS = (
     *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
     "--remote-debugging-pipe",
 )
-PATIENCE_S = 300.0
+PATIENCE_S = 600.0  # then a browser is ended
 
 
 def chromium_path() -> str | None:
@@ -45,6 +46,8 @@ class Page:
         os.close(to_browser)
         os.close(to_us)
         self._out, self._in = os.fdopen(from_us, "wb"), os.fdopen(from_browser, "rb")
+        self._limit = threading.Timer(PATIENCE_S, self._process.kill)
+        self._limit.start()
         self._number, self._session = 0, None
         self.requests: list[str] = []
         self.problems: list[str] = []
@@ -65,6 +68,7 @@ class Page:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._limit.cancel()
         self._process.kill()
         self._process.wait()
         self._out.close()
