@@ -37,6 +37,7 @@ async function ask(job, input, hear) {
 }
 
 function say(text, bad = false) {
+  if ($("status").textContent === text) return; // else it would be read out again
   $("status").textContent = text;
   $("status").className = bad ? "bad" : "";
 }
@@ -220,10 +221,14 @@ const takeScene = scene.takes($("look"), doing, async (image) => {
   say(last.found ? `Found in ${last.seconds.toFixed(2)} s.` : "It is not there, or hidden, or too far away.");
 });
 $("again").addEventListener("click", () => takeScene(examples[1]));
-$("live").addEventListener("click", doing(() => scene.film($("live"), async (image) => {
-  await find(image);
-  say(`Live: ${(1 / last.seconds).toFixed(0)} looks a second.`);
-})));
+$("live").addEventListener("click", doing(async () => {
+  $("answer").ariaLive = "off"; // many a second are too many to be read out
+  await scene.film($("live"), async (image) => {
+    await find(image);
+    say("Live.");
+  });
+  $("answer").ariaLive = "polite";
+}));
 
 // ---- keep it
 
