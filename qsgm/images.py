@@ -111,18 +111,20 @@ def decode_frame(data: bytes, path: Path) -> NDArray[np.uint8]:
     return frame
 
 
-def check_frame(frame: object) -> NDArray[np.uint8]:
+def check_frame(frame: object, margin_px: int = 0) -> NDArray[np.uint8]:
     """A frame as everything here takes it, its pixels in one piece.
 
     Raises:
-        QsgmError: it is something else than (H, W, 3) BGR of bytes, or larger than 4096 px.
+        QsgmError: it is something else than (H, W, 3) BGR of bytes, or larger than 4096 px beside
+            its margins.
     """
     if not isinstance(frame, np.ndarray):
         got = type(frame).__name__
     elif frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         got = f"an array of {frame.dtype} {frame.shape}"
     else:
-        _check_size("the frame", frame.shape[0], frame.shape[1], 1)
+        height, width = (max(side - 2 * margin_px, min(side, 1)) for side in frame.shape[:2])
+        _check_size("the frame", height, width, 1)
         return np.ascontiguousarray(frame)
     raise QsgmError(
         f"the frame is {got}: expected a numpy array of uint8 (height, width, 3), BGR as OpenCV "

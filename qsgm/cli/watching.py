@@ -90,6 +90,7 @@ def _follow(
                 break
             if ended is not None:
                 break
+            del seen  # else its frame was kept while the next one is decoded
     except KeyboardInterrupt as error:
         if frames == 0:
             raise

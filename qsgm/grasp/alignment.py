@@ -110,7 +110,7 @@ class Aligner:
 
 def as_taught(scene: Pyramid, fit: Fit) -> Floats:
     """The scene (64, 64, 3) moved so that the fitted object lies as in the demonstration."""
-    level = scene.levels[FINE]
+    level = scene.level(FINE)
     step = 1 << FINE
     cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
     turn = np.array([[cos, sin], [-sin, cos]])  # from the upright window to the scene

@@ -22,6 +22,7 @@ Floats = NDArray[np.float32]
 WINDOW_PX = 128
 # Halvings of the resolution, coarse to fine.
 COARSE, MIDDLE, FINE = 3, 2, 1
+_STRIP_ROWS = 64  # halved at once
 SCALES = (0.85, 1.0, 1.18)
 # Variance [levels²] that a flat surface's noise has anyway: without it noise correlates with noise.
 NOISE_VARIANCE = 30.0
@@ -49,20 +50,33 @@ class Fit:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """A frame at falling resolution; entry k is halved k times."""
+    """A frame at falling resolution, halved once, twice and three times."""
 
-    levels: tuple[Floats, ...]  # (h, w, 3)
+    halved: tuple[Floats, ...]  # (h, w, 3)
+
+    def level(self, halvings: int) -> Floats:
+        """The frame halved so many times, at least once."""
+        return self.halved[halvings - 1]
 
 
 def pyramid_of(frame: NDArray[np.uint8]) -> Pyramid:
     """Halve a frame (H, W, 3) again and again: each pixel is the mean of four."""
-    levels = [frame.astype(np.float32)]
-    for _ in range(COARSE):
-        height, width = (max(side // 2, 1) for side in levels[-1].shape[:2])
-        even = levels[-1][: 2 * height, : 2 * width]  # else a pixel would be of a little more
-        halved = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(np.asarray(halved, dtype=np.float32))
+    levels = [_halved(frame)]
+    while len(levels) < COARSE:
+        levels.append(_halved(levels[-1]))
     return Pyramid(tuple(levels))
+
+
+def _halved(image: NDArray[np.uint8] | Floats) -> Floats:
+    """Half of an image, strip by strip: the whole of it as floats is four times as large."""
+    height, width = (max(side // 2, 1) for side in image.shape[:2])
+    even = image[: 2 * height, : 2 * width]  # else a pixel would be of a little more
+    halved = np.empty((height, width, 3), np.float32)
+    for top in range(0, height, _STRIP_ROWS):
+        strip = halved[top : top + _STRIP_ROWS]
+        rows = even[2 * top : 2 * (top + len(strip))].astype(np.float32)
+        cv2.resize(rows, (width, len(strip)), strip, interpolation=cv2.INTER_AREA)
+    return halved
 
 
 @dataclass(frozen=True)
@@ -199,7 +213,7 @@ def windows_around(
     A centre is in pixels of the frame; beyond the border the frame is mirrored.
     """
     side, step = WINDOW_PX >> level, 1 << level
-    image = scene.levels[level]
+    image = scene.level(level)
     left, top = (round((value + 0.5) / step - side / 2) - reach for value in center_px)
     region = mirrored_square(image, left, top, side + 2 * reach)
     channels = np.ascontiguousarray(region.transpose(2, 0, 1))

@@ -5,7 +5,7 @@ size; lengths that belong to the drawing are in units of 1/1280 of the canvas wi
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -28,6 +28,7 @@ CANVAS_WIDTH_PX = 1280
 NOTABLE_QUALITY = 0.15
 _HEAT_OPACITY = 0.6
 _CONTOUR_QUALITY = 0.5
+_STRIP_ROWS = 128  # of the canvas, for which the heatmap is drawn at once
 
 _HEAT: Color = (60, 190, 255)  # amber
 _GRIPPER: Color = (255, 255, 255)
@@ -86,7 +87,9 @@ def draw_detection(
     Returns:
         (H', W', 3) BGR: the enlarged frame with a caption below; W' is at least 1280.
     """
-    canvas = _enlarge(frame, 1 / detection.scale, dim=not detection.found)
+    whole, canvas = _enlarge(frame, 1 / detection.scale, _PANEL_HEIGHT)
+    if not detection.found:
+        _dim(canvas.image)
     _draw_heat(canvas, heatmap[0], HALF_CROP_PX - detection.margin_px)
     for other in instances:
         if other.center_px != detection.center_px:
@@ -100,7 +103,8 @@ def draw_detection(
     else:
         _draw_guess(canvas, detection.center_px)
     found = max(len(instances), int(detection.found))
-    return np.concatenate([canvas.image, _caption(canvas, detection, title, found)])
+    _caption(whole[len(canvas.image) :], canvas.unit, detection, title, found)
+    return whole
 
 
 def draw_objects(
@@ -114,7 +118,7 @@ def draw_objects(
         enlarged: to at least 1280 px; else the picture is as large as the frame.
     """
     if enlarged:
-        canvas = _enlarge(frame, 1.0, dim=False)
+        _, canvas = _enlarge(frame, 1.0, 0)
     else:
         canvas = _Canvas(frame.copy(), 1, max(frame.shape[1] / CANVAS_WIDTH_PX, 0.6), 1.0)
     for name, place in places:
@@ -147,15 +151,21 @@ def _label(canvas: _Canvas, text: str, at: Point, color: Color) -> None:
     _text(canvas.image, shown, (x, y), size, color, bold=True)
 
 
-def _enlarge(frame: Picture, reach: float, *, dim: bool) -> _Canvas:
+def _enlarge(frame: Picture, reach: float, below: int) -> tuple[Picture, _Canvas]:
+    """A picture with room below, in drawing units, and the canvas that is the rest of it."""
     scale = max(1, math.ceil(CANVAS_WIDTH_PX / frame.shape[1]))
-    image = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    if dim:
-        grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-        image = cv2.addWeighted(grey, 0.7, np.zeros_like(grey), 0.3, 0)
-    return _Canvas(
-        np.asarray(image, dtype=np.uint8), scale, image.shape[1] / CANVAS_WIDTH_PX, reach
-    )
+    height, width = (scale * side for side in frame.shape[:2])
+    unit = width / CANVAS_WIDTH_PX
+    whole = np.empty((height + round(below * unit), width, 3), np.uint8)
+    cv2.resize(frame, (width, height), whole[:height], interpolation=cv2.INTER_CUBIC)
+    return whole, _Canvas(whole[:height], scale, unit, reach)
+
+
+def _dim(image: Picture) -> None:
+    """Darken a picture (H, W, 3) and take its colours away, in place."""
+    dark = np.rint(np.arange(256, dtype=np.float32) * np.float32(0.7)).astype(np.uint8)
+    grey = cv2.LUT(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dark)
+    cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR, image)
 
 
 def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32], first_px: int) -> None:
@@ -165,24 +175,46 @@ def _draw_heat(canvas: _Canvas, quality: NDArray[np.float32], first_px: int) -> 
     """
     height, width = canvas.image.shape[:2]
     step, first = (side * canvas.scale * canvas.reach for side in (CELL_PX, first_px))
-    cell_of_pixel = np.array([[1 / step, 0, -first / step], [0, 1 / step, -first / step]])
-    smooth = cv2.warpAffine(
-        np.asarray(quality, dtype=np.float32),
-        cell_of_pixel,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-    )
-    smooth = cv2.GaussianBlur(smooth, (0, 0), step / 3)
-    peak = float(np.max(quality))
-    if smooth.max() > 0:  # the blur lowers narrow blobs: give the best cell its own value back
-        smooth = smooth * (peak / smooth.max())
-    opacity = np.clip((smooth - NOTABLE_QUALITY) / (1 - NOTABLE_QUALITY), 0, 1) * _HEAT_OPACITY
-    warm = opacity > 0
-    mixed = canvas.image[warm] + opacity[warm][:, None] * (np.array(_HEAT) - canvas.image[warm])
-    canvas.image[warm] = np.rint(mixed).astype(np.uint8)
-    inside = (smooth >= _CONTOUR_QUALITY).astype(np.uint8)
+    inside = np.zeros((height, width), np.uint8)
+    highest = max(strip.max() for _, strip in _smooth(quality, step, first, (height, width)))
+    # The blur lowers narrow blobs: give the best cell its own value back.
+    gain = float(np.max(quality)) / highest if highest > 0 else 1.0
+    for rows, strip in _smooth(quality, step, first, (height, width)):
+        heat = strip * gain
+        _warm(canvas.image[rows], heat)
+        inside[rows] = heat >= _CONTOUR_QUALITY
     contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(canvas.image, contours, -1, _HEAT, canvas.thick(1.5), cv2.LINE_AA)
+
+
+def _smooth(
+    quality: NDArray[np.float32], step: float, first: float, canvas_hw: tuple[int, int]
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """The quality of every pixel, strip by strip with its rows: all at once takes much memory.
+
+    Cells (rows, cols) are `step` pixels apart, the first one `first` pixels from the corner.
+    """
+    height, width = canvas_hw
+    sigma = step / 3
+    reach = math.ceil(4 * sigma) + 1
+    for start in range(0, height, _STRIP_ROWS):
+        stop = min(start + _STRIP_ROWS, height)
+        top, bottom = max(start - reach, 0), min(stop + reach, height)
+        cell_of_pixel = np.array(
+            [[1 / step, 0, -first / step], [0, 1 / step, (top - first) / step]]
+        )
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        sharp = cv2.warpAffine(quality, cell_of_pixel, (width, bottom - top), flags=flags)
+        smooth = cv2.GaussianBlur(sharp, (0, 0), sigma)
+        yield slice(start, stop), np.asarray(smooth[start - top : stop - top], np.float32)
+
+
+def _warm(image: Picture, heat: NDArray[np.float32]) -> None:
+    """Lay heat (h, w) over a picture (h, w, 3) where it is notable, in place."""
+    opacity = np.clip((heat - NOTABLE_QUALITY) / (1 - NOTABLE_QUALITY), 0, 1) * _HEAT_OPACITY
+    warm = opacity > 0
+    mixed = image[warm] + opacity[warm][:, None] * (np.array(_HEAT) - image[warm])
+    image[warm] = np.rint(mixed).astype(np.uint8)
 
 
 def _draw_window(canvas: _Canvas, center: Point) -> None:
@@ -267,10 +299,10 @@ def _draw_guess(canvas: _Canvas, center: Point) -> None:
         _line(canvas, arc, _BAD, 2)
 
 
-def _caption(canvas: _Canvas, detection: Detection, title: str, found: int) -> Picture:
-    """The panel below the frame: title, verdict and the four values."""
-    width, unit = canvas.image.shape[1], canvas.unit
-    panel = np.full((round(_PANEL_HEIGHT * unit), width, 3), _PANEL, dtype=np.uint8)
+def _caption(panel: Picture, unit: float, detection: Detection, title: str, found: int) -> None:
+    """Fill the panel below the frame: title, verdict and the four values."""
+    width = panel.shape[1]
+    panel[:] = _PANEL
     accent = _GOOD if detection.found else _BAD
     panel[:, : round(10 * unit)] = accent
     verdict = (f"{found} found" if found > 1 else "found") if detection.found else "NOT FOUND"
@@ -284,7 +316,6 @@ def _caption(canvas: _Canvas, detection: Detection, title: str, found: int) -> P
         _text(panel, label, (x, 86 * unit), unit * 0.6, _LABEL)
         _text(panel, value, (x, 124 * unit), unit * 0.9, _VALUE)
     _quality_bar(panel, detection.quality, ((36 + 310 * 3 + 110) * unit, 112 * unit), unit, accent)
-    return panel
 
 
 def _values(detection: Detection) -> list[tuple[str, str]]:

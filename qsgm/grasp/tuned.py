@@ -29,9 +29,9 @@ from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.others import Other
 from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
 from qsgm.grasp.shown import View
-from qsgm.images import check_frame
+from qsgm.images import MAX_SIDE_PX, check_frame
 from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
-from qsgm.runtime import Value, check_interface, open_session, running
+from qsgm.runtime import Value, check_interface, open_session, run_options, running
 from qsgm.tuned_folder import (
     COMMAND,
     DESCRIPTION,
@@ -57,6 +57,10 @@ _LEAST_SIDE_PX = 64
 # more looks are four more occasions to be wrong: there a place has to be surer.
 OTHER_SIZES = (0.5, 0.7, 1.4, 2.0)
 SURE_AT_OTHER_SIZES = 0.9
+# The network sees larger frames strip by strip: 60 MB are enough then, whatever their size. Up to
+# half as large ones (a camera's 640x480) leave ONNX Runtime's memory to the next frame.
+_STRIP_PIXELS = 1 << 20
+_KEPT_PIXELS = _STRIP_PIXELS // 2
 # At the object's scale, larger frames than that are not looked at again.
 _LARGEST_SIDE_PX = 2048
 # Two places of the network that are closer are of the same object.
@@ -97,9 +101,20 @@ class TunedObject:
 
     def heatmap(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
         """A frame (H, W, 3) at the object's scale to quality, sine and cosine (3, rows, cols)."""
-        frame, name = check_frame(frame), self.description.name
+        frame = check_frame(frame, MARGIN_PX)
+        large = frame.shape[0] * frame.shape[1] > _KEPT_PIXELS
+        strips = [
+            self._answer(strip, give_memory_back=large and rows is None)[:, :rows]
+            for strip, rows in _strips(frame)
+        ]
+        return np.concatenate(strips, axis=1)
+
+    def _answer(self, frame: NDArray[np.uint8], *, give_memory_back: bool) -> NDArray[np.float32]:
+        name = self.description.name
+        options = run_options(give_memory_back=give_memory_back)
         with running(f"the object {name!r}", _ADVICE):
-            heatmap: NDArray[np.float32] = self._session.run(["heatmap"], {"frame": frame})[0]
+            heatmap: NDArray[np.float32]
+            (heatmap,) = self._session.run(["heatmap"], {"frame": frame}, options)
         if not _is_of(heatmap, frame):
             raise QsgmError(
                 f"the object {name!r} answers {heatmap.shape} numbers, expected 3 for every window "
@@ -191,18 +206,19 @@ class TunedObject:
         """The frame at the object's scale, mirrored beyond its border.
 
         Raises:
-            QsgmError: too little is left of it.
+            QsgmError: too little is left of it, or it is too much.
         """
         frame = check_frame(frame)
-        scaled, margin = scaled_frame(frame, self.description.scale), self._margin_px
-        least = self._least_side_px
-        if min(scaled.shape[:2]) < least:
-            (height, width), (low, narrow) = frame.shape[:2], scaled.shape[:2]
+        scale, margin, least = self.description.scale, self._margin_px, self._least_side_px
+        sides = scaled_shape(frame.shape[:2], scale)
+        if not least <= min(sides) <= max(sides) <= MAX_SIDE_PX:
+            (height, width), (low, narrow) = frame.shape[:2], sides
             raise QsgmError(
                 f"a frame of {width}x{height} px has {narrow}x{low} at the scale of "
-                f"{self.description.name!r}: expected at least {least} on each side; take it as "
-                "the object's demonstration was taken"
+                f"{self.description.name!r}: expected {least} to {MAX_SIDE_PX} on each side; take "
+                "it as the object's demonstration was taken"
             )
+        scaled = scaled_frame(frame, scale)
         how = cv2.BORDER_REFLECT_101
         seen = cv2.copyMakeBorder(scaled, margin, margin, margin, margin, how)
         return np.asarray(seen, dtype=np.uint8)
@@ -399,6 +415,20 @@ def _view(folder: Path, entry: Mapping[str, Any]) -> View:
     image, mask = decode_patch(data, folder / entry["file"])
     patch = Patch(image, mask, (x, y), bool(entry["cut_out"]))
     return View(patch, float(entry["turn_rad"]), bool(entry["whole"]))
+
+
+def _strips(frame: NDArray[np.uint8]) -> Iterator[tuple[NDArray[np.uint8], int | None]]:
+    """Strips of a frame, and how many rows of windows each is for; of the last, all it has.
+
+    One after the other they give the same heatmap, bit by bit.
+    """
+    height, width = frame.shape[:2]
+    rows = max((_STRIP_PIXELS // width - CROP_PX) // CELL_PX + 1, 1)
+    tops = range(0, max(height - CROP_PX, 0) // CELL_PX + 1, rows)
+    for top in tops[:-1]:
+        first = CELL_PX * top
+        yield frame[first : first + CELL_PX * (rows - 1) + CROP_PX], rows
+    yield frame[CELL_PX * tops[-1] :], None
 
 
 def _is_of(heatmap: NDArray[np.float32], frame: NDArray[np.uint8]) -> bool:

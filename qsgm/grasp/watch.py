@@ -104,6 +104,7 @@ def watch(
         start = time.perf_counter()
         sights = look_for_each(objects, frame, any_distance=any_distance)
         yield Watched(number, seconds, 1e3 * (time.perf_counter() - start), frame, sights)
+        del frame, sights  # else they were kept while the next frame is decoded
 
 
 def open_stream(source: str | int | Path, every: int = 1) -> Stream:
