@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from toys import lay, table, toy
 
-from qsgm.grasp.cells import ACROSS, CELL, SIDE, spread_out
-from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, pyramid_of
+from qsgm.grasp.cells import ACROSS, CELL, SIDE, spread_out, upright
+from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, Template, pyramid_of
 from qsgm.grasp.judge import Appearance
-from qsgm.grasp.patch import cut_patch
+from qsgm.grasp.patch import PATCH_PX, cut_patch
 
 CENTER = (320.0, 240.0)
 APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
@@ -83,3 +83,15 @@ def test_a_third_of_the_object_may_be_hidden_and_the_rest_is_aligned(
     assert math.dist(APPEARANCE.center_of(fit), CENTER) < 1
     assert abs(math.degrees(fit.turn_rad) - 20) < 1
     assert look.score == fit.score
+
+
+def test_what_cells_are_cut_from_is_the_patchs_middle_at_half_size_its_mask_a_share() -> None:
+    patch = cut_patch(lay(toy(), table(), CENTER), CENTER)
+    image, mask = upright(Template(patch))
+    assert (image.shape, mask.shape) == ((SIDE, SIDE, 3), (SIDE, SIDE))
+    edge = (PATCH_PX - 2 * SIDE) // 2
+    middle = np.s_[edge : edge + 2 * SIDE, edge : edge + 2 * SIDE]
+    blocks = patch.mask[middle].reshape(SIDE, 2, SIDE, 2).mean(axis=(1, 3)) / 255
+    np.testing.assert_allclose(mask, blocks, atol=1e-6)
+    colors = patch.image[middle].reshape(SIDE, 2, SIDE, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, colors, atol=1e-3)

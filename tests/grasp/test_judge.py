@@ -8,10 +8,13 @@ from toys import bump, lay, table, toy
 
 from qsgm.grasp.angles import full_degrees
 from qsgm.grasp.candidates import candidate_cells
+from qsgm.grasp.correlation import Fit
 from qsgm.grasp.evidence import NAMES
-from qsgm.grasp.finding import confidence_of
+from qsgm.grasp.finding import Sighting, confidence_of
 from qsgm.grasp.judge import JUDGED, Appearance, cell_center, judge
 from qsgm.grasp.patch import Patch, cut_patch
+from qsgm.grasp.shown import View
+from qsgm.grasp.tuned import _as_detection
 
 CENTER = (320.0, 240.0)
 APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
@@ -98,3 +101,12 @@ def test_any_patch_and_frame_give_finite_evidence(
         for one in judge(appearance, frame, heatmap):
             assert np.isfinite(one.evidence).all()
             assert np.isfinite([*one.center_px, one.lead, one.fit.score]).all()
+
+
+def test_a_sighting_is_found_from_a_quality_of_a_half_on_where_the_patch_lies_or_the_cell() -> None:
+    view = View(cut_patch(lay(toy(), table(), CENTER), CENTER), 0.0, whole=True)
+    for score, center in ((0.9, (1.0, 2.0)), (0.1, (30.0, 40.0))):
+        fit = Fit(score, 0.3, 1.0, (1.0, 2.0))
+        for quality, found in ((0.5, True), (0.49, False)):
+            seen = _as_detection(Sighting(view, fit, 0.5, (1.0, 2.0), quality, (30.0, 40.0)))
+            assert (seen.found, seen.quality, seen.center_px) == (found, quality, center)

@@ -21,6 +21,12 @@ def drawn(found: bool = True, angle_deg: float = 0.0) -> NDArray[np.uint8]:
     return draw_detection(FRAME, NOTHING, detection(found, angle_deg), "mug")
 
 
+def extent(inked: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """First and last row, first and last column of what is inked."""
+    rows, columns = inked.any(axis=1).nonzero()[0], inked.any(axis=0).nonzero()[0]
+    return int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
+
+
 def is_white(picture: NDArray[np.uint8], x: float, y: float) -> bool:
     """Whether the gripper covers a point of the frame [px]."""
     return bool((picture[round(2 * y), round(2 * x)] > 240).all())
@@ -131,3 +137,85 @@ def test_a_names_dark_rim_lies_around_its_letters(enlarged: bool) -> None:
     assert len(ink) > 100
     assert 0 <= ink[0] - changed[0] <= 6
     assert 0 <= changed[-1] - ink[-1] <= 6
+
+
+def test_the_bar_is_filled_as_far_as_the_quality_goes() -> None:
+    for quality, share in ((0.0, 0.0), (0.25, 0.25), (0.9, 0.9), (1.0, 1.0), (1.5, 1.0)):
+        picture = draw_detection(FRAME, NOTHING, replace(detection(), quality=quality), "mug")
+        good = picture[970, 2].tolist()
+        bar = picture[960:, 1050:].tolist()
+        filled = np.array([[pixel == good for pixel in row] for row in bar])[50:]
+        empty = np.array([[pixel == [70, 64, 60] for pixel in row] for row in bar])[50:]
+        top, bottom, left, right = extent(filled | empty)
+        assert (bottom - top + 1, right - left + 1) == (10, 170)
+        inside = filled[top : bottom + 1, left : right + 1]
+        assert inside.sum() == 10 * round(170 * share)
+        assert inside[:, : round(170 * share)].all()
+
+
+def test_the_gripper_is_as_large_as_the_network_sees_it() -> None:
+    """Two bars of 40 px, 76 apart, and between and beyond them an axis of 124, in two px each."""
+    picture = drawn()[: 2 * 480]
+    white = (picture > 240).all(axis=2)
+    x, y = 400, 600
+    corners = (slice(y - 120, y + 120), slice(x - 124, x + 124))
+    for side in (-76, 76):
+        rows = white[y - 100 : y + 100, x + side].nonzero()[0] - 100
+        assert (rows[0], rows[-1]) == (pytest.approx(-40, abs=5), pytest.approx(40, abs=5))
+        columns = white[y - 30, x + side - 20 : x + side + 20].nonzero()[0] - 20
+        assert len(columns) == pytest.approx(8, abs=1)
+    along = white[corners][118:123].any(axis=0).nonzero()[0] - 124
+    assert (along[0], along[-1]) == (pytest.approx(-124, abs=2), pytest.approx(123, abs=2))
+    above = white[y - 30 : y + 30, x + 50].nonzero()[0]
+    assert len(above) == pytest.approx(2, abs=1)
+    middle = white[y - 20 : y + 20, x].nonzero()[0] - 20
+    assert (middle[0], middle[-1]) == (pytest.approx(-5, abs=1), pytest.approx(5, abs=1))
+
+
+def test_the_window_that_the_network_saw_has_corners() -> None:
+    picture = drawn()
+    for right in (-1, 1):
+        for down in (-1, 1):
+            x, y = 200 + 64 * right, 300 + 64 * down
+            for inward in (0, 7, 13):
+                assert is_white(picture, x - inward * right, y)
+                assert is_white(picture, x, y - inward * down)
+            assert not is_white(picture, x - 17 * right, y)
+            assert not is_white(picture, x, y - 17 * down)
+            assert not is_white(picture, x + 4 * right, y)
+            assert not is_white(picture, x, y + 4 * down)
+
+
+@pytest.mark.parametrize("way", [(160.0, 0.0), (-160.0, 0.0), (0.0, 160.0), (0.0, -160.0)])
+def test_the_way_to_the_object_is_an_arrow_from_the_middle(way: tuple[float, float]) -> None:
+    """Turned to the right, arrows to all sides are the same: symmetric, its head before its end."""
+    frame = np.full((640, 640, 3), 128, dtype=np.uint8)
+    found = replace(detection(), center_px=(320 + way[0], 320 + way[1]), displacement_px=way)
+    picture = draw_detection(frame, NOTHING, found, "mug")[:1280].astype(int)
+    blue = (picture[..., 0] > 220) & (picture[..., 1] < 225) & (picture[..., 2] < 150)
+    turns = {(160.0, 0.0): 0, (0.0, 160.0): 1, (-160.0, 0.0): 2, (0.0, -160.0): 3}
+    blue = np.rot90(blue, turns[way])
+    top, bottom, left, right = extent(blue)
+    assert [top, bottom] == pytest.approx([640 - 10, 640 + 10], abs=4)
+    assert [left, right] == pytest.approx([640 - 10, 960 - 14], abs=6)
+    top, bottom, _, _ = extent(blue[:, 700:])
+    assert [top, bottom] == pytest.approx([640 - 8, 640 + 8], abs=4)
+    ends = [columns[0] for columns in (blue[row, 700:].nonzero()[0] for row in (634, 646))]
+    assert ends == pytest.approx([960 - 14 - 16 - 700] * 2, abs=6)
+
+
+def test_the_caption_says_what_was_found_in_words_and_numbers() -> None:
+    turned = detection(angle_deg=-30.04)
+    values = dict(_values(turned))
+    assert values == {
+        "centre (x, y)": "200.0, 300.0 px",
+        "move (right, down)": "-120.0, +60.0 px",
+        "turn (counter-clockwise)": "-30.0 deg",
+        "quality": "0.90",
+    }
+    same = draw_detection(FRAME, NOTHING, turned, "mug")
+    other = draw_detection(FRAME, NOTHING, turned, "cup")
+    changed = (same != other).any(axis=2)
+    top, bottom, left, right = extent(changed)
+    assert 960 < top < bottom < 960 + 60
+    assert 30 < left < right < 150

@@ -204,6 +204,34 @@ def test_edges_gaps_and_sheets_cross_the_middle_of_the_crop() -> None:
     assert len(plan[:2]) == 2
 
 
+def test_surfaces_are_drawn_as_often_and_as_differently_as_they_are_said_to_be() -> None:
+    plan = plan_edges(np.random.default_rng(3), 6000)
+    tile, left, top, strength = plan.grain.T
+    assert set(tile.tolist()) == {0, 1}
+    assert (left.min(), left.max(), top.min(), top.max()) == (0, 64, 0, 64)
+    assert (strength.min(), strength.max()) == (0, 60)
+    assert strength.mean() == pytest.approx(10, abs=0.5)
+    # A far side that hides nothing is 1000 px away, so that its offset is much larger.
+    offsets = np.abs(plan.planes[..., 2] / np.hypot(plan.planes[..., 0], plan.planes[..., 1]))
+    far = (offsets > 800).sum(axis=1)
+    shares = [np.mean(far == count) for count in (3, 2, 0)]
+    assert shares == pytest.approx([1 / 3] * 3, abs=0.03)
+    light, dark = plan.color[far != 2].mean(), plan.color[far == 2].mean()
+    assert light == pytest.approx(127.5, abs=3)
+    assert dark == pytest.approx(0.35 * 127.5 + 1.5, abs=3)
+    rng = np.random.default_rng(4)
+    alike = rng.uniform(0, 255, (4000, 1)) + rng.normal(0, 30, (4000, 3))
+    spreads = []
+    for colors in (plan.color[far != 2].astype(float), np.clip(alike, 0, 255)):
+        inside = colors[np.all((colors > 60) & (colors < 195), axis=1)]
+        spreads.append(inside.std(axis=1).mean())
+    assert spreads[0] == pytest.approx(spreads[1], abs=1)
+    assert (plan.color[far != 2].min(), plan.color[far != 2].max()) == (0, 255)
+    steep = np.hypot(plan.planes[:, 0, 0], plan.planes[:, 0, 1]) / 256 / 255
+    assert np.mean(steep < 0.9) == pytest.approx(0.3, abs=0.02)
+    assert 1 / steep.min() == pytest.approx(16, abs=0.1)
+
+
 def test_the_grain_is_the_hash_it_is_said_to_be() -> None:
     def byte(number: int) -> int:
         number ^= number >> 16
