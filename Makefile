@@ -13,7 +13,7 @@ PACKAGED := pyproject.toml README.md $(shell find qsgm calib export -type f -not
 
 TIMES ?= 50
 
-.PHONY: help demo test robustness lint format clean
+.PHONY: help demo test robustness mutants lint format clean
 .DEFAULT_GOAL := help
 
 help:  ## show these lines
@@ -31,6 +31,11 @@ test: lint  ## lint, types and tests
 
 robustness: .venv-test/installed  ## fuzz, kill and starve it for long; counts at the end
 	QSGM_ROBUSTNESS=$(TIMES) .venv-test/bin/python -m pytest tests/robustness
+
+mutants: .venv-test/installed  ## do the tests bite? an hour of a core; goes on where it was stopped
+	.venv-test/bin/python $(PIP) coverage
+	test -f mutants/coverage || .venv-test/bin/python benchmarks/mutants collect
+	.venv-test/bin/python benchmarks/mutants run
 
 lint: .venv-test/installed  ## check style and formatting
 	.venv-test/bin/ruff check .
