@@ -116,7 +116,7 @@ def export_bundle(
     int8_sgms = {
         k: quantize_sgm(sgm, calibration.ranges[k], bits) for k, sgm in trainee.sgms.items()
     }
-    fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, options.epochs)
+    fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, options.epochs, calibration.looks)
     graphs = build_graphs(trainee, int8_sgms, int8_trunk, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)

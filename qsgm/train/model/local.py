@@ -62,8 +62,12 @@ def columns(network: Network, number: int, x: Tensor) -> Tensor:
     up, left = layer.padding
     if up or left:
         x = F.pad(x.unflatten(2, (height, width)), (0, 0, left, left, up, up)).flatten(2, 3)
-    side = height + 2 * up, width + 2 * left
-    return x[:, :, window_index(side, layer.kernel, layer.stride)].flatten(3)
+    maps = x.unflatten(2, (height + 2 * up, width + 2 * left))
+    rows = maps.unfold(2, layer.kernel[0], layer.stride[0])
+    windows = rows.unfold(3, layer.kernel[1], layer.stride[1])  # (T, B, H', W', C, kh, kw)
+    # Copied by a window's rows: to pick position by position takes 2 to 6 times as long.
+    copied: Tensor = windows.permute(0, 1, 2, 3, 5, 6, 4).flatten(4)
+    return copied.flatten(2, 3)
 
 
 def layer_forward(

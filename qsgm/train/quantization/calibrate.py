@@ -10,8 +10,7 @@ most nearly where the float ones do.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,9 +22,12 @@ from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, SgmRanges, integer_forwa
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
 from qsgm.train.quantization.calibration_runs import (
     EPOCHS,
+    Look,
+    Looks,
     RunPlan,
     Trainee,
     float_moment,
+    measured_moments,
     measured_plans,
     run,
     run_plans,
@@ -52,6 +54,7 @@ class Calibration:
     # Frames that the cosines were measured on and the ranges then compared were not taken from;
     # 0: both were all frames.
     held_out: int
+    looks: Looks = field(default_factory=dict)  # that it had on the way
 
 
 def calibrate(
@@ -84,12 +87,13 @@ def calibrate(
     """
     refuse_unknown(calibrator)
     held_out = held_out_frames(len(lessons)) if calibrator == AUTO else range(0)
-    everything, compared = observe(trainee, lessons, seed, watch, epochs, held_out)
+    looks: Looks = {}
+    everything, compared = observe(trainee, lessons, seed, watch, epochs, held_out, looks)
     levels = 2**activation_bits
     if calibrator == AUTO:
         candidates = quantize_all(trainee, compared, activation_bits)
         judges = held_out or range(len(lessons))
-        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs)
+        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs, looks)
         chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
     else:
         cosines = {layer: {} for layer in trainee.sgms}
@@ -98,7 +102,7 @@ def calibrate(
         layer: everything[layer].ranges(chosen[layer], levels, trainee.label_span)
         for layer in trainee.sgms
     }
-    return Calibration(ranges, chosen, cosines, len(held_out))
+    return Calibration(ranges, chosen, cosines, len(held_out), looks)
 
 
 def refuse_unknown(calibrator: str) -> None:
@@ -121,14 +125,18 @@ def observe(
     watch: Progress,
     epochs: int,
     held_out: range,
+    looks: Looks,
 ) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers]]:
-    """What each SGM sees in the runs on all frames, and on those that are not held out."""
+    """What each SGM sees in the runs on all frames, and on those that are not held out.
+
+    `looks` are added to.
+    """
     everything, compared = (
         {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
     )
     for i in range(len(lessons)):
         watch("calibrate", i, len(lessons))
-        for layer, seen in observe_lesson(trainee, lessons, i, seed, epochs).items():
+        for layer, seen in observe_lesson(trainee, lessons, i, seed, epochs, looks).items():
             everything[layer].merge(seen)
             if i not in held_out:
                 compared[layer].merge(seen)
@@ -137,9 +145,15 @@ def observe(
 
 
 def observe_lesson(
-    trainee: Trainee, lessons: Lessons, i: int, seed: int, epochs: int
+    trainee: Trainee,
+    lessons: Lessons,
+    i: int,
+    seed: int,
+    epochs: int,
+    looks: Looks | None = None,
 ) -> dict[int, SgmObservers]:
-    """What each SGM sees in the runs on one lesson."""
+    """What each SGM sees in the runs on one lesson; `looks` are added to."""
+    kept = list[Look]()
     observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
     for plan in run_plans(trainee.network, trainee.checkpoint.most_layers, epochs):
 
@@ -150,8 +164,11 @@ def observe_lesson(
             return result
 
         lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
-        for _ in run(trainee, lesson, plan, [seed, i], gradient):
-            pass
+        for done, moment in enumerate(run(trainee, lesson, plan, [seed, i], gradient)):
+            if plan.maps and done % plan.measure_every == 0:
+                kept.append(Look.at(moment))
+    if looks is not None and kept:
+        looks[i] = kept
     return observers
 
 
@@ -179,6 +196,7 @@ def judge(
     seed: int,
     watch: Progress,
     epochs: int,
+    looks: Looks,
 ) -> dict[int, dict[str, float]]:
     """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.
 
@@ -190,7 +208,7 @@ def judge(
     for done, i in enumerate(judges):
         watch("choose", done, len(judges))
         for plan in measured_plans(trainee, epochs):
-            for layer, name, value in judge_run(trainee, candidates, lessons, i, plan, seed):
+            for layer, name, value in judge_run(trainee, candidates, lessons, i, plan, seed, looks):
                 cosines[layer][name].append(value)
     watch("choose", len(judges), len(judges))
     return {
@@ -206,15 +224,14 @@ def judge_run(
     i: int,
     plan: RunPlan,
     seed: int,
+    looks: Looks,
 ) -> Iterator[tuple[int, str, float]]:
     """Every now and then along one run, each calibrator's cosine at each SGM it is there for."""
 
     def driver(layer: int, seen: FloatArray) -> FloatArray:
         return trainee.float_trace(layer, seen)[0]
 
-    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
-    steps = run(trainee, lesson, plan, [seed, i], driver)
-    for moment in islice(steps, 0, None, plan.measure_every):
+    for moment in measured_moments(trainee, lessons, i, plan, seed, driver, looks):
         for layer, (seen, floating) in float_moment(trainee, moment).items():
             if layer in plan.measured:
                 for name, sgm in candidates[layer].items():

@@ -6,6 +6,7 @@ run only its current step is in memory.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from qsgm.train.model.fold import fold_net, fold_sgm, run_folded_conv
 from qsgm.train.model.local import LayerState, columns, layer_forward, local_step
 from qsgm.train.model.net import maps_of, positions_of
 from qsgm.train.pretraining.tasks import SeenLesson, see_lesson, start_states
+from qsgm.train.quantization.lessons import Lessons
 from qsgm.weights import to_step_layout
 
 CROPS = 400
@@ -111,8 +113,36 @@ class Moment:
     """One step of a run: the tuned layers before it, and the batch that they are about to see."""
 
     states: list[LayerState]
+    rows: Tensor  # (B,), the batch among the lesson's samples
     features: Tensor  # (1, B, P, C)
     labels: Tensor  # (1, B, L)
+
+
+@dataclass(frozen=True)
+class Look:
+    """All of a moment but what the lesson has: weights and biases, and the batch's rows."""
+
+    weights: list[tuple[Tensor, Tensor]]
+    rows: Tensor
+
+    @staticmethod
+    def at(moment: Moment) -> "Look":
+        return Look([(state.weight, state.bias) for state in moment.states], moment.rows)
+
+    def again(self, task: SeenLesson) -> Moment:
+        """The moment, its momenta forgotten: nothing that is measured asks for them."""
+        states = [LayerState.start(*one) for one in self.weights]
+        return moment_of(states, task, self.rows)
+
+
+# By lesson, of its run with maps. Those take nearly all of the time, and float SGMs drive them
+# whatever is measured, so that one run does for all that is.
+Looks = dict[int, list[Look]]
+
+
+def moment_of(states: list[LayerState], task: SeenLesson, rows: Tensor) -> Moment:
+    """A step on these samples of a lesson."""
+    return Moment(states, rows, task.features[None, rows], task.labels[None, rows])
 
 
 def prepare(checkpoint: Checkpoint) -> Trainee:
@@ -164,12 +194,31 @@ def run(
     generator = torch.Generator().manual_seed(int(np.random.default_rng(seed).integers(2**31)))
     for _ in range(plan.epochs):
         for rows in torch.randperm(len(task.labels), generator=generator).split(BATCH):
-            moment = Moment(states, task.features[None, rows], task.labels[None, rows])
+            moment = moment_of(states, task, rows)
             yield moment
             factor = rate_factor(done, steps)
             states = step(trainee, moment, list(factor * rates), sgm_gradient)
             refuse_unless_finite(states)
             done += 1
+
+
+def measured_moments(
+    trainee: Trainee,
+    lessons: Lessons,
+    i: int,
+    plan: RunPlan,
+    seed: int,
+    sgm_gradient: SgmGradient,
+    looks: Looks,
+) -> Iterator[Moment]:
+    """Every now and then a step of the run on a lesson; of looks that were kept, those."""
+    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
+    if plan.maps and i in looks:
+        task = trainee.seen(lesson, plan.tuned)
+        yield from (look.again(task) for look in looks[i])
+    else:
+        steps = run(trainee, lesson, plan, [seed, i], sgm_gradient)
+        yield from islice(steps, 0, None, plan.measure_every)
 
 
 def step(

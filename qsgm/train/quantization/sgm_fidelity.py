@@ -1,9 +1,7 @@
 """How faithful int8 SGMs are along whole fine-tuning runs on the calibration set."""
 
 from collections.abc import Iterator, Mapping
-from itertools import islice
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,15 +13,18 @@ from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
 from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
 from qsgm.train.quantization.calibration_runs import (
     EPOCHS,
+    Looks,
     Moment,
     RunPlan,
     Trainee,
     float_moment,
+    measured_moments,
     measured_plans,
     passes_of,
-    run,
 )
 from qsgm.train.quantization.lessons import Lessons
+
+NO_LOOKS: Looks = {}
 
 
 def measure(
@@ -33,18 +34,20 @@ def measure(
     seed: int,
     watch: Progress,
     epochs: int = EPOCHS,
+    looks: Looks = NO_LOOKS,
 ) -> dict[int, LayerFidelity]:
     """Fidelity of each int8 SGM, mean over runs on every frame.
 
     Behind layers 4 and 5 it is taken along whole runs of the last three layers, and the int8 SGMs
     drive them, as on the device: what they see is what they have led to. Behind layers 1 to 3 it is
-    taken along the short runs of all layers, which the float SGMs drive: they are quicker here.
+    taken along the short runs of all layers, which the float SGMs drive: they are quicker here, and
+    calibration's `looks` at them can be looked at again.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
     for i in range(len(lessons)):
         watch("measure", i, len(lessons))
         for plan in measured_plans(trainee, epochs):
-            for layer, fidelity in measure_run(trainee, int8_sgms, lessons, i, plan, seed):
+            for layer, fidelity in measure_run(trainee, int8_sgms, lessons, i, plan, seed, looks):
                 measured[layer].append(fidelity)
     watch("measure", len(lessons), len(lessons))
     return {layer: mean_over_run(values) for layer, values in measured.items()}
@@ -57,6 +60,7 @@ def measure_run(
     i: int,
     plan: RunPlan,
     seed: int,
+    looks: Looks,
 ) -> Iterator[tuple[int, LayerFidelity]]:
     """Every now and then along one run, what the SGMs that it is there for are worth."""
 
@@ -65,9 +69,7 @@ def measure_run(
             return trainee.float_trace(layer, seen)[0]
         return integer_forward(int8_sgms[layer], seen)[0]
 
-    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
-    steps = run(trainee, lesson, plan, [seed, i], driver)
-    for moment in islice(steps, 0, None, plan.measure_every):
+    for moment in measured_moments(trainee, lessons, i, plan, seed, driver, looks):
         yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
 
 
