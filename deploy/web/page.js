@@ -4,31 +4,49 @@ import { addCrops, Course, percent, verdictOn } from "./course.js";
 import { Stage, stroke } from "./stage.js";
 
 const EPOCHS = 20;
+const PATIENCE_MS = 3000;
 const $ = (id) => document.getElementById(id);
 
 // ---- the worker
 
-// From a blob it obeys this page's Content-Security-Policy; from a file it would have its own.
-const source = `import ${JSON.stringify(new URL("worker.js", import.meta.url).href)};`;
-const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
-const worker = new Worker(url, { type: "module" });
+/**
+ * Once the service worker has fetched everything it answers for the server: nothing is fetched twice.
+ *
+ * Where there is none, or the page was loaded past it, the server goes on answering.
+ */
+async function kept() {
+  const workers = navigator.serviceWorker;
+  const registered = await workers?.register("sw.js").catch(() => null);
+  if (!registered) return;
+  await workers.ready;
+  if (workers.controller) return;
+  await new Promise((ready) => {
+    workers.addEventListener("controllerchange", ready, { once: true });
+    setTimeout(ready, PATIENCE_MS);
+  });
+}
+
 const waiting = new Map();
 let asked = 0;
-// Until its modules are there, what is sent to it would be lost.
-const started = new Promise((ready, failed) => {
+const started = kept().then(() => new Promise((ready, failed) => {
+  // From a blob it obeys this page's Content-Security-Policy; from a file it would have its own.
+  const source = `import ${JSON.stringify(new URL("worker.js", import.meta.url).href)};`;
+  const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
+  const worker = new Worker(url, { type: "module" });
   worker.addEventListener("error", () => failed(new Error("This browser runs no module workers.")));
   worker.addEventListener("message", ({ data: { id, event, done, error } }) => {
-    if (id === undefined) return ready();
+    // Until its modules are there, what is sent to it would be lost: then it says so, without an id.
+    if (id === undefined) return ready(worker);
     if (event) return waiting.get(id).hear?.(event);
     const { give, fail } = waiting.get(id);
     waiting.delete(id);
     if (error === undefined) give(done);
     else fail(new Error(error));
   });
-});
+}));
 
 async function ask(job, input, hear) {
-  await started;
+  const worker = await started;
   const id = ++asked;
   return new Promise((give, fail) => {
     waiting.set(id, { give, fail, hear });
@@ -256,14 +274,15 @@ $("open").addEventListener("change", doing(async () => {
 
 doing(async () => {
   course.draw();
-  say("Loading.");
-  const offline = navigator.serviceWorker?.register("sw.js").then(() => navigator.serviceWorker.ready);
+  if (!isSecureContext) {
+    throw new Error("Open this page over https: without, browsers withhold checksums and the camera.");
+  }
+  say("Loading 15 MB, once.");
   ({ layers } = await ask("load", null, ({ done, of }) => {
     $("loading").value = done / of;
   }));
   const names = ["example/object.png", "example/scene.png"];
   examples = await Promise.all(names.map((name) => fetch(name).then((file) => file.blob())));
-  await offline?.catch(() => null);
   ready = true;
   $("loading").hidden = true;
   useable();

@@ -18,7 +18,7 @@ FLAGS = (
     *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
     "--remote-debugging-pipe",
 )
-PATIENCE_S = 600.0  # then a browser is ended
+PATIENCE_S = 600.0  # for one thing; a browser is ended after three times that
 
 
 def chromium_path() -> str | None:
@@ -46,7 +46,7 @@ class Page:
         os.close(to_browser)
         os.close(to_us)
         self._out, self._in = os.fdopen(from_us, "wb"), os.fdopen(from_browser, "rb")
-        self._limit = threading.Timer(PATIENCE_S, self._process.kill)
+        self._limit = threading.Timer(3 * PATIENCE_S, self._process.kill)
         self._limit.start()
         self._number, self._session = 0, None
         self.requests: list[str] = []

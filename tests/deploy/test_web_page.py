@@ -28,17 +28,18 @@ pytestmark = [
 READY = "document.body?.dataset.ready !== undefined"
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        """Say nothing."""
-
-
 class Server:
     """A folder served to this machine."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        handler = functools.partial(Quiet, directory=str(folder))
+        self.asked: list[str] = []
+        asked = self.asked
+
+        class Handler(http.server.SimpleHTTPRequestHandler):
+            def log_message(self, *_: object) -> None:
+                asked.append(self.path)
+
+        handler = functools.partial(Handler, directory=str(folder))
         self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
@@ -103,6 +104,13 @@ def assert_says(page: Page, tuned: TunedObject, scene: Path) -> None:
     turn, said = text(page, "turn").split("\n")
     assert said == way
     np.testing.assert_allclose(float(turn.rstrip("°")), abs(expected.angle_deg), atol=0.06)
+
+
+@pytest.mark.usefixtures("page")
+def test_what_is_large_is_fetched_once(server: Server) -> None:
+    large = [path for path in server.asked if path.startswith(("/ort/", "/bundle/", "/example/"))]
+    assert len(large) > 10
+    assert len(large) == len(set(large))
 
 
 def test_an_object_is_taught_found_and_saved_without_a_request(page: Page, tmp_path: Path) -> None:
