@@ -190,18 +190,18 @@ class Session:
 
 
 def _under(name: str, items: Mapping[str, Any]) -> Iterator[Any]:
-    """A test by its name, or all of a module."""
+    """A test by its name, or all of a module or of a function."""
     if name in items:
         yield items[name]
     else:
-        yield from (item for one, item in items.items() if one.startswith(f"{name}::"))
+        yield from (one for key, one in items.items() if key.startswith((f"{name}::", f"{name}[")))
 
 
 def _tested(session: Any, items: list[Any], patch: Any = None) -> int:
     """1 where a test fails, 0 where all pass."""
     if patch is not None:
         function, function.__code__ = patch
-    for item, following in zip(items, [*items[1:], None], strict=True):
+    for item, following in zip(items, [*items[1:], None], strict=False):
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
         if session.testsfailed:
             return 1

@@ -188,3 +188,8 @@ def test_a_module_of_our_own_that_is_missing_is_a_bug(
     monkeypatch.setattr(app, "call", broken)
     with pytest.raises(type(error)):
         cli.run(["predict"])
+
+
+def test_a_program_without_a_stdout_ends_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", None)
+    assert cli.run(["objects", "list", "--json"]) == 0

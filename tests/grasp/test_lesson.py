@@ -10,11 +10,11 @@ from toys import lay, table, toy
 
 from qsgm import finetune, load_object
 from qsgm.bundle import Bundle
-from qsgm.grasp.angles import encode_angle
+from qsgm.grasp.angles import AngleEncoding, encode_angle
 from qsgm.grasp.crops import CROPS, TRAIN_CROPS
 from qsgm.grasp.lesson import GraspLabels, Orientation
 from qsgm.grasp.source import Demonstration, crop_source
-from qsgm.grasp.task import distractors_of
+from qsgm.grasp.task import GraspTask, distractors_of
 from qsgm.grasp.taught import FinetuneResult, finetune_json
 from qsgm.manifest import head_file
 from qsgm.weights import to_step_layout
@@ -35,6 +35,24 @@ def test_labels_are_shifted_by_the_orientation_the_network_sees(
     np.testing.assert_allclose(prepared.labels[positive, 1:], expected[positive], atol=1e-5)
     assert (prepared.labels[~positive] == 0).all()
     assert 0 <= prepared.orientation.strength <= 1
+
+
+@pytest.mark.parametrize("encoding", ["double", "paper"])
+def test_the_tasks_own_scores_count_detections_and_angles_of_positives(
+    encoding: AngleEncoding,
+) -> None:
+    turns = np.radians(np.float32([10, 80, -30, 0]))
+    labels = np.concatenate([np.ones((4, 1)), encode_angle(turns, encoding)], axis=1)
+    seen = np.radians(np.float32([12, -96, -30, 0]))
+    outputs = np.concatenate([np.full((4, 1), 0.9), encode_angle(seen, encoding)], axis=1)
+    labels[3] = 0
+    task = GraspTask(encoding)
+    scores = task.scores(outputs.astype(np.float32), labels.astype(np.float32))
+    assert scores["detection_accuracy"] == 0.75
+    assert scores["angle_mae_deg"] == pytest.approx((2 + 4 + 0) / 3, abs=1e-3)
+    none = task.scores(outputs[3:].astype(np.float32), labels[3:].astype(np.float32))
+    assert none["detection_accuracy"] == 0
+    assert np.isnan(none["angle_mae_deg"])
 
 
 def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180() -> None:
