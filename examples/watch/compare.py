@@ -172,22 +172,23 @@ def worth(scores):
 
 
 def print_table(people):
-    """Mean and spread over people."""
+    """Mean and spread over people; `both` is the mean of what is asked."""
     grids = defaultdict(dict)
     for name in people[0]:
         values = np.array([one[name] for one in people])
         if values.ndim == 2:
             method, epochs, recipe = name.split("/")
-            grids[method, epochs][recipe] = values
+            grids[method, epochs][recipe] = np.column_stack([values, values.mean(axis=1)])
         elif name.startswith("cosine"):
             print(f"{name:44} {values.mean():.5f}")
-    print(f"\n{'':36}{'epochs':>8}" + "".join(f"{one:>18}" for one in ASKED))
+    columns = [*ASKED, "both"]
+    print(
+        f"\n{len(people):2} people{'':27}{'epochs':>8}" + "".join(f"{one:>18}" for one in columns)
+    )
     for (method, epochs), grid in grids.items():
-        print_row(method, epochs, [chosen_by_others(grid, i) for i in range(len(ASKED))])
+        print_row(method, epochs, [chosen_by_others(grid, i) for i in range(len(columns))])
         if method == "backpropagation":
-            best = [
-                max((one[:, i] for one in grid.values()), key=np.mean) for i in range(len(ASKED))
-            ]
+            best = [max((one[:, i] for one in grid.values()), key=np.mean) for i in range(3)]
             print_row(f"{method} at its best", epochs, best)
 
 
