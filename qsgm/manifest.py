@@ -121,6 +121,8 @@ class Manifest:
     initializers: Mapping[str, Place]  # the tuned layers' weights and biases, in network.onnx
     sgms: Mapping[int, SgmEntry]  # by layer, in weights.bin
     files: Mapping[str, FileEntry]
+    # By how many layers are tuned, their groups unless the user says otherwise; else each alone.
+    usual_blocks: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def network(self) -> Network:
@@ -134,7 +136,8 @@ class Manifest:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, as they are written."""
-        return {
+        usual = {str(tuned): text for tuned, text in self.usual_blocks.items()}
+        return ({"usual_blocks": usual} if usual else {}) | {
             "format": FORMAT,
             "version": VERSION,
             "task": {"name": self.task.name, **self.task.settings},
@@ -205,8 +208,15 @@ def manifest_from(values: Mapping[str, Any], path: Path) -> Manifest:
     missing = sorted(needed_files(network, trunk, recipes["sgm"].optimizer, blocks) - files.keys())
     if missing:
         raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
+    usual = dict[int, str]()
+    if "usual_blocks" in values:
+        usual = read.part(
+            "usual_blocks",
+            "by numbers of layers some of `blocks`",
+            lambda found: _usual_from(found, blocks),
+        )
     task = TaskRecord(name, network, heads, settings)
-    return Manifest(task, most, trunk, blocks, recipes, initializers, sgms, files)
+    return Manifest(task, most, trunk, blocks, recipes, initializers, sgms, files, usual)
 
 
 def needed_files(
@@ -324,6 +334,13 @@ def _blocks_from(texts: Any, network: Network, most: int) -> tuple[str, ...]:
         and all(one.sgm_layers or one == alone for one in blocks)
     )
     return _require(tuple(texts), sane)
+
+
+def _usual_from(values: Any, blocks: Sequence[str]) -> dict[int, str]:
+    """Blocks by how many layers they are."""
+    found = {int(tuned): _require(text, text in blocks) for tuned, text in values.items()}
+    sane = all(len(parse_blocks(text).layers) == tuned for tuned, text in found.items())
+    return _require(found, sane)
 
 
 def _recipes_from(values: Any, blocks: Sequence[str]) -> Mapping[Method, Recipes]:

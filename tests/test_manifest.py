@@ -61,6 +61,18 @@ def read_or_refusal(values: dict[str, Any], path: Path) -> Manifest | str:
         return str(error)
 
 
+def test_usual_blocks_are_some_of_those_that_can_be_tuned(
+    bundle_folder: Path, written: dict[str, Any]
+) -> None:
+    path = bundle_folder / MANIFEST
+    some = written | {"usual_blocks": {"3": "4,5-6"}}
+    assert manifest_from(some, path).usual_blocks == {3: "4,5-6"}
+    assert manifest_from(some, path).to_json() == some
+    for bad in ({"2": "4,5-6"}, {"3": "4-5,6-7"}, {"x": "4,5,6"}, {"3": 4}, [1], 7, None):
+        with pytest.raises(QsgmError, match="'usual_blocks' is damaged"):
+            manifest_from(written | {"usual_blocks": bad}, path)
+
+
 def test_a_manifest_comes_back_from_what_it_writes(
     bundle_folder: Path, written: dict[str, Any]
 ) -> None:

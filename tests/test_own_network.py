@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,22 @@ import torch
 from torch import nn
 
 import qsgm
-from qsgm import QsgmError, Samples, SampleTask, cli, learn, load_bundle, load_network, load_task
+from qsgm import (
+    QsgmError,
+    Samples,
+    SampleTask,
+    Settings,
+    cli,
+    learn,
+    load_bundle,
+    load_network,
+    load_task,
+    resolve,
+)
 from qsgm.task import heads_to_json
-from qsgm.train import from_torch
+from qsgm.train import from_torch, load_checkpoint
+from qsgm.train.pretraining.first_rates import candidates
+from qsgm.train.pretraining.rates import EARLY_RATE_GRID
 from qsgm.train.samples import build as building
 from qsgm.train.samples.drawn import quicker, usual_config
 
@@ -28,7 +42,7 @@ FILE = EXAMPLES / "digits_task.py"
 
 
 def small(task: SampleTask, **chosen: Any) -> Any:
-    config = quicker(usual_config(task, **chosen), 0.1)
+    config = replace(quicker(usual_config(task, **chosen), 0.1), first_rates=(5e-3, 1e-1))
     early = replace(config.early, tasks=3, crops_per_task=40, epochs=2, looks=(1, 2))
     return replace(config, early=early)
 
@@ -45,11 +59,16 @@ def digits() -> Any:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint and a bundle, as the command line makes them."""
+    """A checkpoint and a bundle, as the command line makes them; where rates start is tried out."""
+
+    def automatic(task: SampleTask, **chosen: Any) -> Any:
+        return replace(small(task, **chosen), first_rates=2)
+
     folder = tmp_path_factory.mktemp("digits")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "usual_config", small)
-        patch.setattr(building, "USUAL", building.ExportOptions(epochs=1))
+        patch.setattr(building, "usual_config", automatic)
+        usual = replace(building.USUAL, epochs=1)
+        patch.setattr(building, "USUAL", usual)
         task = ["--task", str(FILE)]
         kept, bundle = str(folder / "mine.pt"), str(folder / "mine")
         assert cli.run(["pretrain", *task, "-o", kept]) == 0
@@ -91,6 +110,12 @@ def test_a_bundle_names_its_task_and_holds_no_code(made: Path) -> None:
     manifest = json.loads((made / "mine" / "manifest.json").read_text())
     assert manifest["task"] == {"name": "digits", "tuned": 2}
     assert not [one for one in (made / "mine").iterdir() if one.suffix == ".py"]
+
+
+def test_where_rates_start_is_chosen_and_said(made: Path) -> None:
+    card = load_checkpoint(made / "mine.pt").card
+    assert tuple(card["config"]["first_rates"]) in {*candidates(2)}
+    assert '"first_rates": [' in (made / "mine.md").read_text()
 
 
 def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
@@ -160,10 +185,39 @@ def test_gradients_can_be_compared_along_one_run(
     assert (values["layers"], [*values["fidelity"]]) == (2, ["3"])
     assert [one["step"] for one in values["fidelity_over_run"]] == [0, 20, 40, 60]
     every = printed(capsys, "fidelity", *own, "--layers", 4, "--epochs", 1, path)
-    assert [*every["fidelity"]] == ["1", "2", "3"]
+    assert [*every["fidelity"]] == ["1", "3"]
     assert "--center concerns" in refused(capsys, "fidelity", *own, "--center", "1,1", path)
     assert "pass --task FILE.py" in refused(capsys, "fidelity", *own[:2], path)
     assert "choose 1 to 4" in refused(capsys, "finetune", *own, "--layers", 7, path)
+
+
+def test_a_device_tunes_layers_in_the_groups_that_pay_unless_told_otherwise(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle = load_bundle(made / "mine")
+    usual, rates = bundle.manifest.usual_blocks, load_checkpoint(made / "mine.pt").rates
+    assert usual == {2: "3,4", 3: "2-3,4", 4: "1,2-3,4"}
+    for tuned, text in usual.items():
+        plan = resolve(Settings(layers=tuned), bundle)
+        assert str(plan.blocks) == text
+        assert plan.recipe.rates == rates[text]
+        early = {*rates[text][:-2]}
+        assert len(early) == (tuned > 2)  # one for all that were not meta-trained
+        assert early <= {*EARLY_RATE_GRID}
+        assert rates[text][-2:] == rates["3,4"]
+    assert str(resolve(Settings(layers=4, optimizer="adam"), bundle).blocks) == "1,2,3,4"
+    assert str(resolve(Settings(layers=4, blocks="1,2,3,4"), bundle).blocks) == "1,2,3,4"
+    assert str(resolve(Settings(layers=4, method="bp"), bundle).blocks) == "1-4"
+    own, path = ["--task", FILE], samples(tmp_path / "hand.npz", 60)
+    printed(capsys, "slim", "--bundle", made / "mine", "--blocks", usual[4], "-o", tmp_path / "s")
+    told = [*own, "--layers", 4, "--epochs", 2, "-o", tmp_path / "tuned", path]
+    whole = printed(capsys, "finetune", "--bundle", made / "mine", *told)
+    assert whole["blocks"] == usual[4]
+    slim = printed(capsys, "finetune", "--bundle", tmp_path / "s", *told)
+    assert [slim[key] for key in ("blocks", "scores", "rates")] == [
+        whole[key] for key in ("blocks", "scores", "rates")
+    ]
+    assert "blocks 1,2-3,4" in run(capsys, "finetune", "--bundle", tmp_path / "s", *told)
 
 
 def test_what_benchmarks_count_is_counted_of_any_network(
@@ -266,7 +320,8 @@ def test_an_array_of_samples_is_pretrained_on_as_a_json_file_says(
     task, seen = digits(), list[Any]()
     about = {"network": task.network.to_json(), "heads": heads_to_json(task.heads)}
     (tmp_path / "pool.json").write_text(json.dumps(about | {"samples": "pool.npz"}))
-    monkeypatch.setattr(building, "pretrain_samples", lambda *given: seen.append(given))
+    made = SimpleNamespace(card={"config": {"first_rates": [0.1]}}, rates={"4": (0.2,)})
+    monkeypatch.setattr(building, "pretrain_samples", lambda *given: seen.append(given) or made)
     arguments = ["pretrain", "--task", str(tmp_path / "pool.json"), "--hidden", "8", "--json"]
     assert cli.run([*arguments, "-o", str(tmp_path / "mine.pt")]) == 0
     taken, config = seen[0][0], seen[0][5]

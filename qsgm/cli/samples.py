@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,11 +37,15 @@ def pretrain_task(
     source = hashlib.sha256(read_file(file, _MOST_BYTES, "a task file")).hexdigest()
     with progress() as watch:
         said = f" --task {as_text(file.name)}"
-        host.pretrain_samples(task, output, seed, device, watch, sizes, None, said, source)
+        made = host.pretrain_samples(task, output, seed, device, watch, sizes, None, said, source)
+    first = made.card["config"]["first_rates"]
+    learnt = next(rates for rates in made.rates.values() if len(rates) == len(first))
     if as_json:
         values = {"output": str(output), "seed": seed, "device": device, "task": task.name}
-        print_json(values)
+        print_json(values | {"first_rates": first, "rates": dict(made.rates)})
     else:
+        started, ended = (", ".join(f"{rate:.2g}" for rate in some) for some in (first, learnt))
+        typer.echo(f"rates of the last {len(first)} layers: from {started} to {ended}")
         tell("pretrained", output)
 
 
@@ -50,7 +55,7 @@ def export_task(
     """`qsgm fold-and-quantize --task`."""
     task = _host_task(file)
     host = host_module("qsgm.train.samples.build")
-    options = host.ExportOptions(epochs=host.USUAL.epochs, **chosen)
+    options = replace(host.USUAL, **chosen)
     with progress() as watch:
         report = host.export_samples(task, checkpoint, output, watch, options)
     show(report.to_json(), report, as_json)

@@ -5,7 +5,7 @@ graph, and write them with the manifest that :mod:`qsgm.bundle` reads.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from qsgm.progress import Progress
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
-from qsgm.train.export_report import ExportReport, LayerReport, Provenance, model_card
+from qsgm.train.export_report import ExportReport, GroupRow, LayerReport, Provenance, model_card
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.memory import with_peaks
 from qsgm.train.graphs.optimizers import OPTIMIZERS, Optimizer
@@ -53,6 +53,7 @@ from qsgm.train.graphs.trunk import (
     network_model,
     trunk_model,
 )
+from qsgm.train.grouping import cost_of_blocks, sgm_cost, usual_blocks
 from qsgm.train.heads import activate
 from qsgm.train.model.arrays import FLAT_ARRAYS, CurvatureArrays, FoldedNet
 from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
@@ -82,6 +83,8 @@ class ExportOptions:
     blocks: tuple[Blocks, ...] = ()  # to be tuned beside each layer on its own and :func:`grouped`
     calibrator: str = AUTO  # see :func:`qsgm.train.quantization.calibrate.calibrate`
     activation_bits: ActivationBits = 16  # of the int8 SGMs' inputs, in one u8 plane or two
+    # Groups in which SGMs pay in the place of :func:`grouped`; devices tune those as is usual.
+    paying: bool = False
 
 
 def export_bundle(
@@ -109,7 +112,9 @@ def export_bundle(
     check_replaceable(output_folder, WEIGHTS)
     trainee = prepare(load_checkpoint(checkpoint_path))
     most, bits = trainee.checkpoint.most_layers, options.activation_bits
-    exported = exported_blocks(trainee.network, most, options.blocks)
+    usual = paying_groups(trainee) if options.paying else {}
+    groups = [*usual.values()] if options.paying else None
+    exported = exported_blocks(trainee.network, most, options.blocks, groups)
     fold_error = check_folding(trainee, lessons)
     trainee, int8_trunk = calibrate_trunk(trainee, lessons, watch)
     calibration = calibrate(trainee, lessons, SEED, watch, options.epochs, options.calibrator, bits)
@@ -129,6 +134,9 @@ def export_bundle(
     size = sum(len(data) for data in files.values())
     report = ExportReport(str(output_folder), layers, calibration, fold_error, size)
     manifest = describe(trainee, exported, files, sgms)
+    if usual:
+        texts = {tuned: str(blocks) for tuned, blocks in usual.items()}
+        manifest = replace(manifest, usual_blocks=texts)
     files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, lessons)).encode()
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
@@ -136,7 +144,30 @@ def export_bundle(
         steps = steps_of(trainee.network, most, exported)
         manifest = with_peaks(Bundle(new, manifest), steps, watch)
         (new / MANIFEST).write_text(manifest.text(), encoding="utf-8")
-    return report
+    return replace(report, groups=tuple(group_rows(trainee, usual, manifest)))
+
+
+def paying_groups(trainee: Trainee) -> dict[int, Blocks]:
+    """By how many layers are tuned, the groups in which SGMs pay."""
+    checkpoint, late = trainee.checkpoint, meta_trained(trainee.checkpoint)
+    shapes = {k: [conv.weight.shape for conv in sgm.convs] for k, sgm in trainee.sgms.items()}
+    return usual_blocks(trainee.network, checkpoint.most_layers, shapes, late)
+
+
+def group_rows(
+    trainee: Trainee, usual: Mapping[int, Blocks], manifest: Manifest
+) -> Iterator[GroupRow]:
+    """What the chosen groups cost beside each layer on its own and backpropagation."""
+    network = trainee.network
+    shapes = {k: [conv.weight.shape for conv in sgm.convs] for k, sgm in trainee.sgms.items()}
+    sgms = {k: sgm_cost(network, k, some) for k, some in shapes.items()}
+    for blocks in usual.values():
+        whole, singles = one_block(blocks.layers), single_layers(blocks.layers)
+        every = (blocks, singles, whole)
+        macs = [cost_of_blocks(network, one, sgms).macs for one in every]
+        names = [step_file("float", "sgd", one) for one in every]
+        peaks = [manifest.files[name].peak_activation_bytes or 0 for name in names]
+        yield GroupRow(str(blocks), macs[0] / macs[2], macs[1] / macs[2], *peaks)
 
 
 def steps_of(network: Network, most_layers: int, blocks: Sequence[Blocks]) -> dict[str, Blocks]:
@@ -208,10 +239,15 @@ def grouped(network: Network, most_layers: int) -> list[Blocks]:
     return [one for one in blocks if len(one.layers) <= most_layers]
 
 
-def exported_blocks(network: Network, most_layers: int, more: Sequence[Blocks]) -> list[Blocks]:
+def exported_blocks(
+    network: Network,
+    most_layers: int,
+    more: Sequence[Blocks],
+    groups: Sequence[Blocks] | None = None,
+) -> list[Blocks]:
     """What the bundle can tune with SGMs; raises QsgmError where that is not possible.
 
-    First every number of layers, each layer on its own, then the groups.
+    First every number of layers, each layer on its own, then the groups, :func:`grouped` without.
     """
     for blocks in more:
         if len(blocks.layers) > most_layers or not blocks.sgm_layers:
@@ -221,7 +257,8 @@ def exported_blocks(network: Network, most_layers: int, more: Sequence[Blocks]) 
             )
         parse_blocks(str(blocks), network.depth)
     singles = [single_layers(network.last(tuned)) for tuned in range(1, most_layers + 1)]
-    return list(dict.fromkeys([*singles, *grouped(network, most_layers), *more]))
+    groups = grouped(network, most_layers) if groups is None else groups
+    return list(dict.fromkeys([*singles, *groups, *more]))
 
 
 def calibrate_trunk(
@@ -361,9 +398,14 @@ def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Re
         name: {str(one): (optimizer.rate,) * len(one.layers) for one in whole}
         for name, optimizer in OPTIMIZERS.items()
     }
-    late = len(checkpoint.curvatures) or MAML_LAYERS  # for which the gain of short runs was found
+    late = meta_trained(checkpoint)  # for which the gain of short runs was found
     gains = {str(one): checkpoint.short_gain if len(one.layers) >= late else 1.0 for one in blocks}
     return {"sgm": Recipes("sgd", sgm, gains), "bp": Recipes("adam", bp)}
+
+
+def meta_trained(checkpoint: Checkpoint) -> int:
+    """How many of the last layers were meta-trained."""
+    return len(checkpoint.curvatures) or MAML_LAYERS
 
 
 def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,11 @@ _HEADERS = (
 LEGEND = (
     "range, scale: of the activation channels; cos: cosine of int8, float and true gradients; "
     "norm ratio: |int8|/|true|; bytes: of the SGM's constants"
+)
+GROUP_LEGEND = (
+    "MAC: of a step over backpropagation's, counted; peak: activations alive at once in a step of "
+    "32 samples; alone: each layer with its own SGM; bp: backpropagation. Devices tune these, or "
+    "what `--blocks` says, which `fold-and-quantize --blocks` exports"
 )
 
 
@@ -97,6 +102,23 @@ class LayerReport:
 
 
 @dataclass(frozen=True)
+class GroupRow:
+    """Layers in the groups in which SGMs pay, in float; peaks are bytes of activations."""
+
+    blocks: str
+    macs: float  # of a step over backpropagation's
+    macs_alone: float  # if each layer had its SGM
+    peak: int
+    peak_alone: int
+    peak_backprop: int
+
+    def cells(self) -> tuple[str, ...]:
+        """What a table shows of it."""
+        peaks = (f"{one / 1000:,.1f}" for one in (self.peak, self.peak_alone, self.peak_backprop))
+        return (self.blocks, f"{self.macs:.2f}", f"{self.macs_alone:.2f}", *peaks)
+
+
+@dataclass(frozen=True)
 class ExportReport:
     """What :func:`qsgm.train.export.export_bundle` did."""
 
@@ -105,6 +127,7 @@ class ExportReport:
     calibration: Calibration
     fold_max_abs_error: float
     bundle_bytes: int
+    groups: tuple[GroupRow, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """The stable keys of `qsgm fold-and-quantize`, then the others."""
@@ -124,13 +147,15 @@ class ExportReport:
                 "int8": sum(layer.int8_bytes for layer in layers),
             },
             "bundle_bytes": self.bundle_bytes,
+            "groups": [asdict(row) for row in self.groups],
         }
 
     def __rich__(self) -> RenderableType:
         title = f"{self.output}: int8 SGMs, mean over the calibration runs"
         cells = [layer.cells() for layer in self.layers.values()]
         layers = table(title, _HEADERS, cells, left=(), padding=TIGHT)
-        return Group(layers, legend(LEGEND + "\n"), calibrators(self.calibration))
+        groups = (group_table(self.groups), legend(GROUP_LEGEND)) if self.groups else ()
+        return Group(layers, legend(LEGEND + "\n"), calibrators(self.calibration), *groups)
 
 
 @dataclass(frozen=True)
@@ -152,6 +177,12 @@ def calibrators(calibration: Calibration) -> RenderableType:
     title = "cos int8,float of each calibrator's ranges"
     rows = calibrator_rows(calibration)
     return Group(table(title, calibrator_headers(calibration), rows, left=()), why)
+
+
+def group_table(rows: Sequence[GroupRow]) -> RenderableType:
+    """What devices tune as is usual, and what it costs."""
+    headers = ("\nlayers", "MAC\nx bp", "\nalone", "peak\n[kB]", "\nalone", "\nbp")
+    return table("groups of layers in which SGMs pay", headers, [row.cells() for row in rows])
 
 
 def judged(calibration: Calibration) -> bool:

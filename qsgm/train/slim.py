@@ -158,6 +158,7 @@ def kept_manifest(manifest: Manifest, blocks: Blocks) -> Manifest:
         manifest,
         most_layers=len(blocks.layers),
         blocks=(str(blocks),),
+        usual_blocks={k: text for k, text in manifest.usual_blocks.items() if text == str(blocks)},
         recipes=kept,
         initializers={name: manifest.initializers[name] for name in names},
     )

@@ -83,7 +83,7 @@ def resolve(settings: Settings, bundle: Bundle, recipe: Recipe | None = None) ->
         QsgmError: the settings contradict each other, or the bundle cannot do what they ask for.
     """
     layers = bundle.network.last(settings.layers)
-    with_sgms = _sgm_blocks(settings, layers)
+    with_sgms = _sgm_blocks(settings, layers, bundle)
     blocks = _trained_blocks(settings, with_sgms)
     bundle.check_blocks(blocks)
     return Plan(
@@ -112,10 +112,12 @@ def peak_activation_bytes(
     return {method: bundle.peak_activation_bytes(name) for method, name in names.items()}
 
 
-def _sgm_blocks(settings: Settings, layers: range) -> Blocks:
-    """The blocks of a run with SGMs."""
+def _sgm_blocks(settings: Settings, layers: range, bundle: Bundle) -> Blocks:
+    """The blocks of a run with SGMs; groups are trained with SGD only."""
+    usual = bundle.manifest.usual_blocks.get(len(layers))
     if settings.blocks is None:
-        return single_layers(layers)
+        alone = usual is None or settings.optimizer == "adam"
+        return single_layers(layers) if alone else parse_blocks(str(usual), layers[-1])
     blocks = parse_blocks(settings.blocks, layers[-1])
     if len(blocks.layers) != settings.layers:
         raise QsgmError(

@@ -12,6 +12,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from qsgm.blocks import single_layers
 from qsgm.fidelity import LayerFidelity
 from qsgm.tables import number, plain_table
 from qsgm.task import Scores
@@ -148,7 +149,9 @@ def run_title(result: Result, name: str) -> str:
     """What was tuned, and how."""
     settings = result.plan.settings
     how = settings.method if settings.method == "bp" else f"sgm {settings.precision}"
-    which = f"blocks {settings.blocks}" if settings.blocks else f"last {settings.layers} layers"
+    which = f"last {settings.layers} layers"
+    if settings.method == "sgm" and result.blocks != single_layers(result.blocks.layers):
+        which = f"blocks {result.blocks}"
     return f"{name}: {which}, {how}, {settings.epochs} epochs"
 
 

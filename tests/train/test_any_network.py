@@ -31,7 +31,13 @@ from qsgm.train.heads import error
 from qsgm.train.model.arrays import FLAT_ARRAYS
 from qsgm.train.model.curvature import Curvature
 from qsgm.train.model.fold import fold_net, folded_start, run_folded, run_folded_sgm
-from qsgm.train.model.local import LayerState, local_step, outputs, true_gradients
+from qsgm.train.model.local import (
+    LayerState,
+    group_gradients,
+    local_step,
+    outputs,
+    true_gradients,
+)
 from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.quantization.trunk import feature_steps, quantize_trunk
 from qsgm.train.quantization.trunk_ranges import observe_samples
@@ -135,6 +141,27 @@ def test_a_local_step_and_true_gradients_are_autograds(shape: Shape, data: st.Da
         found = torch.autograd.grad(total, list(activations.values()))
         for k, gradient in zip(activations, found, strict=True):
             assert_equal(true[k][task], gradient.flatten(2).transpose(1, 2))
+
+
+@settings(max_examples=40)
+@given(cases(), st.data())
+def test_gradients_inside_of_groups_are_autograds(case: Case, data: st.DataObject) -> None:
+    network, blocks = case.network, blocks_of(data.draw, case.network)
+    tasks, (features, labels) = (f(case, len(blocks.layers)) for f in (weights_of, data_of))
+    found = group_gradients(network, blocks.groups, states_of(tasks), features, labels, made_up)
+    for task, weights in enumerate(tasks):
+        side = network.before(blocks.layers[0])
+        x = features[task].transpose(1, 2).unflatten(2, side)
+        for group in blocks.groups:
+            x, behind = x.detach().requires_grad_(), {}
+            for k in group:
+                x = behind[k] = plain_layer(network.layer(k), *weights[k], x)
+            after = x.flatten(2).transpose(1, 2)
+            objective = (after * made_up(group[-1], after.detach(), labels[task])).sum()
+            for k, gradient in zip(
+                group, torch.autograd.grad(objective, [*behind.values()]), strict=True
+            ):
+                assert_equal(found[k][task], gradient.flatten(2).transpose(1, 2))
 
 
 @EVERY_SHAPE

@@ -175,16 +175,38 @@ def true_gradients(
     heads: Heads,
 ) -> dict[int, Tensor]:
     """Per-sample gradients on every tuned layer's activation by backpropagation, written out."""
-    inputs, befores, x = {}, {}, features
-    layers = list(zip(network.last(len(states)), states, strict=True))
-    for layer, state in layers:
-        inputs[layer] = x
-        befores[layer], x = layer_forward(network, layer, state, columns(network, layer, x))
-    gradients = {network.depth: losses.error(heads, x, labels[:, :, None])}
-    for layer, state in layers[:0:-1]:
-        dz = through_activation(network, layer, befores[layer], gradients[layer])
-        d_columns = dz @ state.weight.transpose(1, 2)[:, None]
-        gradients[layer - 1] = sum_windows(network, layer, d_columns)
+
+    def error(_: int, raw: Tensor, known: Tensor) -> Tensor:
+        return losses.error(heads, raw, known[:, :, None])
+
+    whole = (network.last(len(states)),)
+    return group_gradients(network, whole, states, features, labels, error)
+
+
+def group_gradients(
+    network: Network,
+    groups: Sequence[range],
+    states: Sequence[LayerState],
+    features: Tensor,
+    labels: Tensor,
+    gradient_of: GradientOf,
+) -> dict[int, Tensor]:
+    """Per-sample gradients on every tuned layer's activation, carried back inside of each group.
+
+    On the activation of a group's last layer it is what `gradient_of` gives.
+    """
+    of_layer = dict(zip(network.last(len(states)), states, strict=True))
+    gradients, x = dict[int, Tensor](), features
+    for group in groups:
+        befores = {}
+        for layer in group:
+            col = columns(network, layer, x)
+            befores[layer], x = layer_forward(network, layer, of_layer[layer], col)
+        gradients[group[-1]] = gradient_of(group[-1], x, labels)
+        for layer in group[:0:-1]:
+            dz = through_activation(network, layer, befores[layer], gradients[layer])
+            d_columns = dz @ of_layer[layer].weight.transpose(1, 2)[:, None]
+            gradients[layer - 1] = sum_windows(network, layer, d_columns)
     return gradients
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
 from qsgm.schedule import MOMENTUM, rate_factor
 from qsgm.task import Task
 from qsgm.train.heads import activate, error, meta_objective
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.local import LayerState, local_step, outputs
+from qsgm.train.model.local import GradientOf, LayerState, group_gradients, local_step, outputs
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
@@ -36,6 +37,7 @@ class UpdateRule:
     curvatures: Mapping[int, Curvature]
     rates: tuple[float, ...]  # of the tuned layers, at the start of a run
     task: Task
+    blocks: Blocks | None = None  # those layers in groups; None: each on its own
 
     def gradient_of(self, layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         """Gradient (T, B, P, C) on a layer's activation; labels (T, B, L)."""
@@ -60,11 +62,19 @@ def fine_tune(
         factor = rate_factor(step - 1, len(batches))
         rates = [torch.tensor(rate * factor) for rate in rule.rates]
         network, bent = rule.task.network, rule.curvatures
-        states = local_step(
-            network, states, features, labels, rates, rule.gradient_of, MOMENTUM, bent
-        )
+        gradient_of: GradientOf = rule.gradient_of
+        if rule.blocks is not None:
+            groups = rule.blocks.groups
+            found = group_gradients(network, groups, states, features, labels, gradient_of)
+            gradient_of = _known(found)
+        states = local_step(network, states, features, labels, rates, gradient_of, MOMENTUM, bent)
         if step % (len(batches) // epochs) == 0:
             yield states
+
+
+def _known(gradients: Mapping[int, Tensor]) -> GradientOf:
+    """Gradients that have been computed already, by layer."""
+    return lambda layer, _activation, _labels: gradients[layer]
 
 
 def run_sgms(

@@ -56,7 +56,7 @@ def record_examples(
         batches = shuffled_batches(chunk.support, config.epochs, seed)
         for number, rows in enumerate(batches):
             features, labels = chunk.features[:, rows].float(), chunk.labels[:, rows]
-            states, activations, gradients = _backprop_step(states, features, labels, rates, task)
+            states, activations, gradients = backprop_step(states, features, labels, rates, task)
             if number % config.record_every == 0:
                 for layer in layers:
                     seen[layer].append((activations[layer], labels, gradients[layer]))
@@ -91,7 +91,7 @@ def fit_sgm(
     return sgm.eval()
 
 
-def _backprop_step(
+def backprop_step(
     states: list[LayerState], features: Tensor, labels: Tensor, rates: Sequence[float], task: Task
 ) -> tuple[list[LayerState], dict[int, Tensor], dict[int, Tensor]]:
     """One step on true gradients; also every layer's activation and gradient."""

@@ -26,17 +26,20 @@ import torch
 from torch import nn
 
 import qsgm
-from qsgm.blocks import single_layers
+from qsgm.blocks import Blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
 from qsgm.progress import Progress
 from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.model.fold import folded_start, write_back
+from qsgm.train.grouping import usual_blocks
+from qsgm.train.model.curvature import FLAT
+from qsgm.train.model.fold import convolutions, folded_start, write_back
 from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.backbone import BackboneConfig, BackboneTraining, in_memory_format
 from qsgm.train.pretraining.evaluate import Score, UpdateRule
+from qsgm.train.pretraining.first_rates import candidates, choose_first, rate_alone
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, OuterFigures
 from qsgm.train.pretraining.map_sgms import MapConfig, MapMatching
 from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
@@ -46,6 +49,7 @@ from qsgm.train.pretraining.rates import (
     RatesConfig,
     block_rates,
     choose_early,
+    choose_grouped,
     choose_late,
     choose_short_gain,
     late_candidates,
@@ -63,8 +67,9 @@ class PretrainConfig:
 
     hidden: tuple[int, ...] = (64, 64)
     # Of the late layers, which are meta-trained, where that starts: the first of them learns, those
-    # behind it hold still enough for its SGM to know what they do.
-    first_rates: tuple[float, ...] = (6e-3, 1e-3, 3e-3)
+    # behind it hold still enough for its SGM to know what they do. A number: so many layers, whose
+    # rates are tried out.
+    first_rates: tuple[float, ...] | int = (6e-3, 1e-3, 3e-3)
     tasks: int = 400
     crops_per_task: int = 400
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
@@ -72,6 +77,13 @@ class PretrainConfig:
     maml: MamlConfig = field(default_factory=MamlConfig)
     early: MapConfig = field(default_factory=MapConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
+    # Whether rates are found for the groups of layers in which SGMs pay, too.
+    grouped: bool = False
+
+    @property
+    def late(self) -> int:
+        """How many of the last layers are meta-trained."""
+        return self.first_rates if isinstance(self.first_rates, int) else len(self.first_rates)
 
 
 @dataclass(frozen=True)
@@ -79,6 +91,7 @@ class Learnt:
     """What the five stages come to."""
 
     net: ConvNet
+    first_rates: tuple[float, ...]  # where meta-training started
     rule: UpdateRule  # its rates are those of the late layers
     rates: dict[str, tuple[float, ...]]  # by blocks
     short_gain: float
@@ -139,9 +152,9 @@ def pretrain(
     with one_thread():
         learnt = _learn(partial, net, task, config, seed, watch)
         done = task if last_stage is None else last_stage(learnt, seed, watch)
-    card = _card(
-        _command(seed, device, config) + arguments, device, config, extra, learnt.score, partial
-    )
+    command = _command(seed, device, config) + arguments
+    config = replace(config, first_rates=learnt.first_rates)
+    card = _card(command, device, config, extra, learnt.score, partial)
     rule = learnt.rule
     checkpoint = Checkpoint(
         task_record(done),
@@ -167,15 +180,16 @@ def _learn(
     watch: Progress,
 ) -> Learnt:
     """Stages 2 to 5; `net` gets its new start."""
-    late = len(config.first_rates)
+    late = config.late
     tasks = _draw(net, task, config.tasks, config.crops_per_task, seed + 1, watch, late)
     sgms = _match(partial, net, tasks, config, task, seed, watch)
-    rule = _meta_train(partial, net, sgms, tasks, config, task, seed, watch)
+    first = _first_rates(net, sgms, tasks, config, task, watch)
+    rule = _meta_train(partial, net, sgms, tasks, first, config, task, seed, watch)
     early = _match_early(partial, net, rule, task, config, seed, watch)
     rule = replace(rule, sgms={**early, **rule.sgms})
     rates, gain, score = _choose_rates(net, rule, task, config, seed, watch)
     rule = replace(rule, rates=rates[str(single_layers(task.network.last(late)))])
-    return Learnt(net, rule, rates, gain, score)
+    return Learnt(net, first, rule, rates, gain, score)
 
 
 @contextmanager
@@ -268,15 +282,19 @@ def _match(
     watch: Progress,
 ) -> dict[int, Sgm]:
     torch.manual_seed(seed + 3)
-    layers = task.network.last(len(config.first_rates))
+    layers = task.network.last(config.late)
     sgms = {layer: Sgm(task.network, layer, config.hidden) for layer in layers[:-1]}
     if "sgms" in partial.data:
         for layer, sgm in sgms.items():
             sgm.load_state_dict(partial.data["sgms"][layer])
         return {layer: sgm.eval() for layer, sgm in sgms.items()}
-    # All but the first hold still here: what its SGM regresses is then a function of its input.
-    rates = (config.first_rates[0], *[0.0] * len(sgms))
     start = folded_start(net, len(layers))
+    if isinstance(config.first_rates, int):
+        rate = rate_alone(tasks, start, task, config.matching, seed) if sgms else 0.0
+    else:
+        rate = config.first_rates[0]
+    # All but the first hold still here: what its SGM regresses is then a function of its input.
+    rates = (rate, *[0.0] * len(sgms))
     examples = record_examples(tasks, start, rates, task, config.matching, seed)
     done, total = 0, len(sgms) * config.matching.fit_steps
 
@@ -292,18 +310,41 @@ def _match(
     return sgms
 
 
-def _meta_train(
-    partial: Partial,
+def _first_rates(
     net: ConvNet,
     sgms: dict[int, Sgm],
     tasks: TaskSet,
     config: PretrainConfig,
     task: DrawnTask,
+    watch: Progress,
+) -> tuple[float, ...]:
+    """Where meta-training starts."""
+    if isinstance(config.first_rates, tuple):
+        return config.first_rates
+    done, total = 0, len([*candidates(config.late)])
+
+    def after_run(score: Score) -> None:
+        nonlocal done
+        done += 1
+        watch("first rates", done, total, {"objective": score.objective})
+
+    rule = UpdateRule(sgms, FLAT, (), task)
+    return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
+
+
+def _meta_train(
+    partial: Partial,
+    net: ConvNet,
+    sgms: dict[int, Sgm],
+    tasks: TaskSet,
+    first_rates: tuple[float, ...],
+    config: PretrainConfig,
+    task: DrawnTask,
     seed: int,
     watch: Progress,
 ) -> UpdateRule:
-    start, rates = folded_start(net, len(config.first_rates)), config.first_rates
-    training = MetaTraining(config.maml, task, tasks, start, sgms, rates, seed)
+    start = folded_start(net, len(first_rates))
+    training = MetaTraining(config.maml, task, tasks, start, sgms, first_rates, seed)
     if "meta" in partial.data:
         training.resume(partial.data["meta"])
     mean: dict[str, float] = {}
@@ -369,8 +410,9 @@ def _choose_rates(
     sizes, network, late = config.rates, task.network, len(rule.rates)
     tasks = _draw(net, task, sizes.tasks, sizes.crops_per_task, seed + 2, watch, late)
     done = 0
+    groups = _groups(rule, late) if config.grouped else []
     total = len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
-    total += (network.depth - late) * len(EARLY_RATE_GRID)
+    total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
 
     def after_run(score: Score) -> None:
         nonlocal done
@@ -384,9 +426,25 @@ def _choose_rates(
     if late < network.depth:
         count, samples = sizes.early_tasks, sizes.early_crops_per_task
         pixels = _draw(net, task, count, samples, seed + 6, watch, network.depth)
-        rates |= choose_early(rule, folded_start(net, network.depth), pixels, sizes, after_run)
+        whole = folded_start(net, network.depth)
+        rates |= choose_early(rule, whole, pixels, sizes, after_run)
+        grouped = choose_grouped(rule, whole, pixels, sizes, groups, after_run)
+    else:
+        grouped = {}
     singles = {str(single_layers(network.last(k))): of_layers for k, of_layers in rates.items()}
-    return singles | block_rates(network, rates[late]), gain, score
+    return singles | (grouped if config.grouped else block_rates(network, rates[late])), gain, score
+
+
+def _groups(rule: UpdateRule, late: int) -> list[Blocks]:
+    """Groups of more layers than were meta-trained in which SGMs pay."""
+    network = rule.task.network
+    shapes = {k: [(*c.weight.shape,) for c in convolutions(sgm)] for k, sgm in rule.sgms.items()}
+    usual = usual_blocks(network, network.depth, shapes, late)
+    return [
+        blocks
+        for tuned, blocks in usual.items()
+        if tuned > late and blocks != single_layers(blocks.layers)
+    ]
 
 
 def _check_device(device: str) -> None:

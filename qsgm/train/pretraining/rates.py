@@ -9,6 +9,7 @@ from itertools import product
 
 from torch import Tensor
 
+from qsgm.blocks import Blocks
 from qsgm.network import Network
 from qsgm.train.model.curvature import FLAT
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, best_rates, run_sgms
@@ -100,6 +101,38 @@ def choose_short_gain(
         scores[(gain,)] = run_sgms(trial, start, tasks, config.short_epochs)
         after_run(scores[(gain,)])
     return best_rates(scores)[0]
+
+
+def choose_grouped(
+    rule: UpdateRule,
+    start: Start,
+    pixels: TaskSet,
+    config: RatesConfig,
+    every: Sequence[Blocks],
+    after_run: AfterRun,
+) -> dict[str, Rates]:
+    """The best rates for layers in groups: one for all in front of the meta-trained ones.
+
+    Args:
+        rule: how layers learn; its rates are those of the meta-trained layers.
+        start: of all layers.
+        pixels: tasks as layer 1 sees them.
+        config: sizes.
+        every: groups of more layers than were meta-trained.
+        after_run: told about every run.
+    """
+    chosen = {}
+    for blocks in every:
+        skipped = len(start) - len(blocks.layers)
+        seen = behind(rule.task.network, start[:skipped], pixels)
+        scores = {}
+        for rate in EARLY_RATE_GRID:
+            rates = (rate,) * (len(blocks.layers) - len(rule.rates)) + rule.rates
+            trial = replace(rule, rates=rates, blocks=blocks)
+            scores[rates] = run_sgms(trial, start[skipped:], seen, config.early_epochs, chunk=1)
+            after_run(scores[rates])
+        chosen[str(blocks)] = best_rates(scores)
+    return chosen
 
 
 def choose_early(

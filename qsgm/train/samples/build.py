@@ -13,7 +13,7 @@ from qsgm.train.model.net import ConvNet
 from qsgm.train.pretraining.pretrain import PretrainConfig, pretrain
 from qsgm.train.samples.drawn import DrawnLessons, DrawnSamples, usual_config
 
-USUAL = ExportOptions(epochs=5)
+USUAL = ExportOptions(epochs=5, paying=True)
 
 
 def build(

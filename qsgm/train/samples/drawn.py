@@ -20,8 +20,7 @@ from qsgm.train.pretraining.rates import RatesConfig
 
 CALIBRATION_LESSONS = 8
 HIDDEN = (32, 32)
-# Of the layers that are meta-trained, the last one first: each in front of it learns slower.
-_RATES = (1e-1, 5e-3, 2e-3)
+MOST_LATE = 3  # layers that are meta-trained
 
 
 @dataclass(frozen=True)
@@ -84,10 +83,10 @@ class DrawnLessons:
 
 def usual_config(task: SampleTask, hidden: tuple[int, ...] = HIDDEN) -> PretrainConfig:
     """Sizes for a network of some ten thousand weights: minutes on one core."""
-    late = min(task.tuned, len(_RATES))
     return PretrainConfig(
         hidden=hidden,
-        first_rates=_RATES[:late][::-1],
+        first_rates=min(task.tuned, MOST_LATE),
+        grouped=True,
         tasks=64,
         crops_per_task=200,
         backbone=BackboneConfig(steps=600, loader_processes=0),
