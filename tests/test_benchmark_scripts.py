@@ -120,6 +120,22 @@ def test_growth_times_every_size_and_draws(
     assert cv2.imread(str(picture)) is not None
 
 
+def test_depth_compares_steps_with_backpropagations_and_draws(tmp_path: Path) -> None:
+    picture = tmp_path / "depth.png"
+    printed, values = told(
+        tmp_path, "depth.py", "--depths", "3,5", "--repeats", 1, "--picture", picture
+    )
+    assert max(map(len, printed.splitlines())) <= 80
+    for by_depth in values["networks"].values():
+        assert [*by_depth] == ["3", "5"]
+        grown = {name: by_depth["5"]["steps"][name]["peak_bytes"] for name in ("backprop", "alone")}
+        first = by_depth["3"]["steps"]["alone"]["peak_bytes"]
+        assert grown["alone"] < 1.01 * first  # whatever the depth
+        assert grown["alone"] < grown["backprop"]
+    assert values["networks"]["maps"]["3"]["groups"] == "1,2,3"
+    assert cv2.imread(str(picture)) is not None
+
+
 @pytest.fixture
 def peer(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Gives a module of `benchmarks/peers` by its name."""
