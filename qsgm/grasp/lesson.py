@@ -100,7 +100,8 @@ class GraspLesson:
         crops, turns = self.crops, self.turns_rad
         known = np.array([0.0 if turn is None else turn for turn in turns])
         alike = np.array([turn is not None for turn in turns])
-        seen = decode_angle(outputs[:, 1], outputs[:, 2], self.encoding)
+        # In float32 arctan2's last bits are the processor's own.
+        seen = decode_angle(*outputs[:, 1:].T.astype(np.float64), self.encoding)
         lying = seen - crops.plan.turn_rad - known[crops.shown]
         # Held-out crops have no say in it.
         taught = (crops.plan.quality > 0) & (np.arange(len(crops)) < self.taught)

@@ -105,7 +105,7 @@ def _places(at: NDArray[np.float32], side: int, border: int) -> NDArray[np.intp]
 def _recolored(crop: Pixels, color: NDArray[np.float32], out: Pixels) -> None:
     """Fixed point: 10 bits behind the point, half added, rounded down."""
     mix = np.rint(color[:, :3] * np.float32(1 << _COLOR_BITS)).astype(np.int32)
-    shift = np.rint((color[:, 3] + np.float32(0.5)) * np.float32(1 << _COLOR_BITS))
+    shift = np.rint(color[:, 3] * np.float32(1 << _COLOR_BITS)) + (1 << _COLOR_BITS) // 2
     total = crop.astype(np.int32) @ mix.T + shift.astype(np.int32)
     out[:] = np.clip(total >> _COLOR_BITS, 0, 255)
 

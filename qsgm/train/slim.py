@@ -38,6 +38,8 @@ from qsgm.train.graphs.memory import with_peaks
 from qsgm.train.graphs.sharing import SharedConstants, constants_elsewhere, shared_sgm, whole_model
 from qsgm.train.graphs.short_names import shorten
 
+PLAIN = "bundle.txt"
+
 
 @dataclass(frozen=True)
 class SlimReport:
@@ -107,6 +109,9 @@ def slim_bundle(
     files |= {NETWORK: network, WEIGHTS: shared.data, **task_files(bundle)}
     entries = {name: kept_entry(bundle, name, data) for name, data in files.items()}
     manifest = replace(kept_manifest(bundle.manifest, blocks), sgms=sgms, files=entries)
+    files[PLAIN] = plain_text(manifest, blocks).encode()
+    listed = entries | {PLAIN: kept_entry(bundle, PLAIN, files[PLAIN])}
+    manifest = replace(manifest, files=listed)
     with new_folder(output, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
@@ -116,6 +121,26 @@ def slim_bundle(
         (new / MANIFEST).write_bytes(files[MANIFEST])
     sizes = {name: len(data) for name, data in sorted(files.items())}
     return SlimReport(str(output), str(blocks), sizes)
+
+
+def plain_text(manifest: Manifest, blocks: Blocks) -> str:
+    """What a slim bundle's manifest says of a run, for readers without JSON: docs/bundle.md."""
+    recipe, layers = manifest.recipes["sgm"], blocks.layers
+    files = {"network": NETWORK, "weights": WEIGHTS, "head": head_file(len(layers))}
+    files["trunk"] = trunk_file(manifest.trunk, layers)
+    files |= {f"step_{one}": step_file(one, recipe.optimizer, blocks) for one in PRECISIONS}
+    files |= {Path(name).stem: name for name in task_names(manifest)}
+    rates = recipe.rates[recipe.optimizer][str(blocks)]
+    gain = recipe.short_gains.get(str(blocks), 1.0) if recipe.optimizer == "sgd" else 1.0
+    lines = ["qsgm-bundle-text 1", f"task {manifest.task.name}"]
+    lines += [f"{k} {v}" for k, v in manifest.task.settings.items() if isinstance(v, str)]
+    lines += [f"layers {layers[0]} {len(layers)}", f"rates {' '.join(map(str, rates))}"]
+    lines.append(f"short_gain {gain}")
+    for k in layers:
+        weight, bias = (manifest.initializers[f"{kind}{k}"] for kind in ("weight", "bias"))
+        lines.append(f"layer{k} {' '.join(map(str, weight.shape))} {weight.offset} {bias.offset}")
+    lines += [f"{key} {manifest.files[name].sha256} {name}" for key, name in files.items()]
+    return "\n".join(lines) + "\n"
 
 
 def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
@@ -130,9 +155,14 @@ def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
 
 
 def task_files(bundle: Bundle) -> dict[str, bytes]:
-    """What the task added to the bundle: neither graphs nor constants nor the model card."""
-    names = (name for name in bundle.manifest.files if not name.endswith((".onnx", ".bin", ".md")))
-    return {name: bundle.read(name) for name in names}
+    """What the task added to the bundle, by name."""
+    return {name: bundle.read(name) for name in task_names(bundle.manifest)}
+
+
+def task_names(manifest: Manifest) -> list[str]:
+    """The task's own files: neither graphs nor constants nor text that goes with them."""
+    others = (".onnx", ".bin", ".md")
+    return [name for name in manifest.files if not name.endswith(others) and name != PLAIN]
 
 
 def kept_entry(bundle: Bundle, name: str, data: bytes) -> FileEntry:
