@@ -75,7 +75,7 @@ class Aligner:
         best = replace(fit, score=look.score), look
         for _ in range(_STEPS):
             step = self._step(look)
-            here = _stepped(here, step)
+            here = stepped(here, step)
             if (_distances(here, fit) > _FURTHEST).any():
                 break
             look = self.look(scene, here)
@@ -135,7 +135,7 @@ def _means(image: Floats, cells: Cells) -> Floats:
     return np.asarray(sums / cells.size[:, None], dtype=np.float32)
 
 
-def _stepped(fit: Fit, step: Doubles) -> Fit:
+def stepped(fit: Fit, step: Doubles) -> Fit:
     """The fit from which the patch is off by nothing, if it was off by `step` (4,)."""
     right, down, turn, growth = step
     angle, scale = fit.turn_rad - float(turn), fit.scale * float(np.exp(-growth))

@@ -1,11 +1,14 @@
 """Lay the demonstration's patch over a scene: where, how far turned and how large it fits best.
 
 Masked, normalised colour correlation: of the patch only the object's pixels count, each channel
-around its own mean, so that neither the table nor the light matters. Coarse to fine: at an eighth
-of the resolution every turn and a few scales are tried at every place within 16 px of a candidate;
-the best few go on to a quarter of it. All trials of one level are three matrix products.
+around its own mean, so that neither the table nor the light matters. One correlation over all of
+the object is ruled by what hides a part of it, so most of the score is what its parts say, each
+by itself. Coarse to fine: at an eighth of the resolution every turn and a few scales are tried at
+every place within 16 px of a candidate; the best few go on to a quarter of it. All trials of one
+level are a few matrix products.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import cos, radians, sin
@@ -28,14 +31,19 @@ SCALES = (0.85, 1.0, 1.18)
 NOISE_VARIANCE = 30.0
 
 _COARSE_POSES = tuple(
-    (float(turn), scale) for scale in SCALES for turn in np.deg2rad(np.arange(0, 360, 10))
+    (float(turn), scale) for scale in SCALES for turn in np.deg2rad(np.arange(0, 360, 15))
 )
 _COARSE_REACH = 2  # px of the level
-_MIDDLE_TURNS = (-radians(5), 0.0, radians(5))
+_MIDDLE_TURNS = (-radians(6), 0.0, radians(6))
 _MIDDLE_SCALES, _MIDDLE_REACH = (0.93, 1.0, 1.07), 2
 # Turns that differ by less are the same hypothesis.
 _SAME_TURN = np.deg2rad(25)
 _STARTS = 3
+# Parts of a window, across and down: 32 px of the frame each.
+_PARTS = 4
+# What their own agreement counts; the rest is that of the whole.
+_PARTS_COUNT = np.float32(2 / 3)
+_TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,33 @@ def _halved(image: NDArray[np.uint8] | Floats) -> Floats:
 
 
 @dataclass(frozen=True)
+class Parts:
+    """K turned and scaled patches cut into P parts of E pixels, as columns of matrices."""
+
+    centred: Floats  # (P, 3 E, K): pixel minus the part's mean, times its mask
+    mask: Floats  # (P, E, K), sums to 1 in each part
+    share: Floats  # (P, K), of the object's pixels, sums to 1
+    variance: Floats  # (P, K)
+
+    @staticmethod
+    def of(colour: Floats, mask: Floats) -> "Parts":
+        """Cut patches (K, 3, D) with masks (K, D) that sum to 1."""
+        pixels, covered = _in_parts(colour), _in_parts(mask[:, None])[:, :, 0]
+        share = covered.sum(axis=2)
+        weight = covered / np.maximum(share, _TINY)[..., None]
+        pixels = pixels - np.einsum("pkce,pke->pkc", pixels, weight)[..., None]
+        centred = pixels * weight[:, :, None]
+        variance = np.einsum("pkce,pkce->pk", centred, pixels)
+        columns = centred.reshape(*share.shape, -1).transpose(0, 2, 1)
+        return Parts(
+            np.ascontiguousarray(columns),
+            np.ascontiguousarray(weight.transpose(0, 2, 1)),
+            share,
+            variance,
+        )
+
+
+@dataclass(frozen=True)
 class Trials:
     """K turned and scaled patches at one level, as rows of matrices."""
 
@@ -87,6 +122,7 @@ class Trials:
     mask: Floats  # (K, D), sums to 1
     variance: Floats  # (K,)
     mean: Floats  # (K, 3)
+    parts: Parts
 
 
 @dataclass(frozen=True)
@@ -132,7 +168,7 @@ def coarse_fits(
     """
     trials = template.coarse_trials()
     around = [windows_around(scene, COARSE, center, _COARSE_REACH) for center in centers_px]
-    scores, _, _ = correlate(np.concatenate([windows for windows, _ in around]), trials)
+    scores = agreement(np.concatenate([windows for windows, _ in around]), trials)
     of_each = scores.reshape(len(around), -1, len(_COARSE_POSES))
     return [
         _distinct(some, places, _COARSE_POSES)
@@ -183,11 +219,44 @@ def _scores(
     center_px: tuple[float, float],
     reach: int,
 ) -> tuple[Floats, Floats]:
-    """Correlation (A, K) of K poses at A places, and the places (A, 2) [px of the frame]."""
+    """Agreement (A, K) of K poses at A places, and the places (A, 2) [px of the frame]."""
     trials = template.trials(level, poses)
     windows, places = windows_around(scene, level, center_px, reach)
-    score, _, _ = correlate(windows, trials)
-    return score, places
+    return agreement(windows, trials), places
+
+
+def agreement(windows: Floats, trials: Trials) -> Floats:
+    """How well windows (A, 3, D) fit K trials, at most 1: all at once, and part by part (A, K).
+
+    A part that disagrees counts nothing, however much it disagrees.
+    """
+    whole, _, _ = correlate(windows, trials)
+    apart = _by_parts(windows, trials.parts)
+    return np.asarray(whole + _PARTS_COUNT * (apart - whole), dtype=np.float32)
+
+
+def _by_parts(windows: Floats, parts: Parts) -> Floats:
+    """What the parts' own correlations come to (A, K), each counting as it covers the object."""
+    seen = _in_parts(windows)
+    count, places, channels, pixels = seen.shape
+    mean = (seen.reshape(count, -1, pixels) @ parts.mask).reshape(count, places, channels, -1)
+    variance = np.einsum("pace,pace->pae", seen, seen) @ parts.mask
+    variance -= np.einsum("pack,pack->pak", mean, mean)
+    noisy = np.maximum(variance, 0, out=variance)
+    noisy += NOISE_VARIANCE
+    noisy *= (parts.variance + NOISE_VARIANCE)[:, None]
+    product = seen.reshape(count, places, -1) @ parts.centred
+    product /= np.sqrt(noisy, out=noisy)
+    np.maximum(product, 0, out=product)
+    return np.asarray(np.einsum("pak,pk->ak", product, parts.share), dtype=np.float32)
+
+
+def _in_parts(images: Floats) -> Floats:
+    """Square images (N, M, D) cut into parts (P, N, M, E)."""
+    count, planes, pixels = images.shape
+    cell = math.isqrt(pixels) // _PARTS
+    cut = images.reshape(count, planes, _PARTS, cell, _PARTS, cell).transpose(2, 4, 0, 1, 3, 5)
+    return np.ascontiguousarray(cut).reshape(_PARTS**2, count, planes, cell * cell)
 
 
 def correlate(windows: Floats, trials: Trials) -> tuple[Floats, Floats, Floats]:
@@ -218,13 +287,18 @@ def windows_around(
     region = mirrored_square(image, left, top, side + 2 * reach)
     channels = np.ascontiguousarray(region.transpose(2, 0, 1))
     views = sliding_window_view(channels, (side, side), (1, 2))  # (3, rows, columns, side, side)
-    windows = views.transpose(1, 2, 0, 3, 4).reshape(-1, 3, side * side)
-    at = np.arange(2 * reach + 1)
-    places = np.empty((len(at), len(at), 2), np.float32)
-    for axis, first in enumerate((left, top)):
-        along = step * (first + at + side / 2) - 0.5
-        places[..., axis] = along if axis == 0 else along[:, None]
-    return windows, places.reshape(-1, 2)
+    down, right = _diamond(reach)
+    windows = np.ascontiguousarray(views[:, down, right].swapaxes(0, 1))
+    corner = np.stack([left + right, top + down], axis=1)
+    places = (step * (corner + side / 2) - 0.5).astype(np.float32)
+    return windows.reshape(len(places), 3, side * side), places
+
+
+def _diamond(reach: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of what is at most `reach` steps from the middle of a square."""
+    at = np.abs(np.arange(-reach, reach + 1))
+    down, right = np.nonzero(at[:, None] + at <= reach)
+    return down, right
 
 
 def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
@@ -240,11 +314,12 @@ def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) 
     planes = np.ascontiguousarray(turned.reshape(len(poses), -1, 4).transpose(0, 2, 1))
     colour, mask = planes[:, :3], planes[:, 3]
     mask /= np.maximum(mask.sum(axis=1, keepdims=True), 1e-6)
+    parts = Parts.of(colour, mask)
     mean = np.einsum("kcd,kd->kc", colour, mask)
     colour -= mean[..., None]
     centred = colour * mask[:, None]
     variance = np.einsum("kcd,kcd->k", centred, colour)
-    return Trials(centred.reshape(len(poses), -1), mask, variance, mean)
+    return Trials(centred.reshape(len(poses), -1), mask, variance, mean, parts)
 
 
 def _motion(patch_px: int, side: int, turn: float, scale: float) -> NDArray[np.float64]:

@@ -51,6 +51,9 @@ _RIM_PX, _OUTER_PX, _INNER_PX = 5, 13, 3
 _LARGEST_LOGIT = 8.0
 # A cell with less of the object than that share of the fullest one's says nothing.
 _LEAST_CELL = 0.25
+# How much edges count beside the score when one pose of a place is preferred to another: fitted on
+# drawn scenes, where right poses are the preferred ones in 87 of 100 instead of 83.
+_EDGES_COUNT, _OUTLINE_COUNTS = 0.6, 1.75
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,13 @@ def evidence(reference: Reference, look: Look, scale: float, quality: float, lea
         lead,
     )
     return np.array(values, np.float32)
+
+
+def firmness(reference: Reference, look: Look) -> float:
+    """How firmly a pose holds, to prefer one to another: its score, and edges where they belong."""
+    edges = _edge_agreement(look.seen, reference)
+    outline = _outline_share(look.seen, reference)
+    return look.score + _EDGES_COUNT * edges + _OUTLINE_COUNTS * outline
 
 
 def _of_cells(look: Look) -> tuple[float, ...]:

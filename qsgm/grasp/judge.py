@@ -1,9 +1,11 @@
 """Look closer at a heatmap's candidates and judge each: the second opinion of the patch.
 
 The network proposes places. The demonstration's patch is laid over each, coarse to fine: cheap
-looks for all, closer ones for the few that fit best. Of these the two ways round are compared.
+looks for all, closer ones for the few poses that fit best, at every place several turns, since the
+best of a coarse look is often not the right one. Of the best the two ways round are compared.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,19 +24,27 @@ from qsgm.grasp.correlation import (
     pyramid_of,
 )
 from qsgm.grasp.crops import HALF_CROP_PX
-from qsgm.grasp.evidence import Reference, evidence, reference_of
+from qsgm.grasp.evidence import Reference, evidence, firmness, reference_of
 from qsgm.grasp.patch import PATCH_PX, Patch
+from qsgm.grasp.snapping import snapped
 
 CELL_PX = 16
-# Cells of the heatmap that the patch is laid over, and how many of these it is laid over finely.
+# Cells of the heatmap that the patch is laid over, and how many places are judged.
 PROPOSED, JUDGED = 12, 4
-# What the network's log odds count beside a correlation when the few are chosen.
+# For each of these, so many poses are looked at closer, and so many are aligned.
+_CLOSER, _ALIGNED = 3, 2
+# Of these at most so many are moved to their edges.
+_SNAPPED = 3
+# What the network's log odds count beside a correlation when poses are chosen.
 _QUALITY_WEIGHT = 0.02
-# Of each of the few, so many turns are tried at a quarter of the resolution, if they fit nearly as
-# well as the best one.
-_TURNS, _NEARLY = 2, 0.2
-# Closer than that, two candidates are the same.
+# Poses closer than that [px, rad] are the same one, by coarse looks and by closer ones.
+_SAME_POSE = (20.0, np.deg2rad(25)), (10.0, np.deg2rad(17))
+# Closer than that, two candidates are the same place.
 _SAME_PX = 24.0
+# A pose that fits so well is where it belongs: its edges need not be looked for.
+_FITS_WELL = 0.8
+# What alignment by pixels has to gain over the pose that edges gave.
+_LEAST_GAIN = 0.02
 # Turns that differ from a half turn by less are the opposite way round.
 _OPPOSITE_RAD = np.deg2rad(30)
 # With such a lead at a quarter of the resolution the other way round need not be looked at closer.
@@ -74,15 +84,27 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class _Start:
-    fits: tuple[Fit, ...]  # best first, at different turns
+class _Pose:
+    """A way in which the object may lie."""
+
+    fit: Fit
     cell: tuple[int, int]
-    quality: float
+    quality: float  # of the network
 
     @property
     def promise(self) -> float:
         odds = np.log(max(self.quality, 1e-6) / max(1 - self.quality, 1e-6))
-        return self.fits[0].score + _QUALITY_WEIGHT * float(np.clip(odds, -8, 8))
+        return self.fit.score + _QUALITY_WEIGHT * float(np.clip(odds, -8, 8))
+
+
+@dataclass(frozen=True)
+class _Laid:
+    """A pose after it was aligned exactly."""
+
+    pose: _Pose  # before
+    fit: Fit
+    look: Look
+    firmness: float
 
 
 def judge(
@@ -99,17 +121,19 @@ def judge(
         heatmap: (3, rows, cols) of that frame.
         count: how many to judge at most.
     """
-    scene = pyramid_of(frame)
+    scene, template = pyramid_of(frame), appearance.template
     cells = candidate_cells(heatmap[0], max(PROPOSED, 2 * count))
-    fits = coarse_fits(appearance.template, scene, [cell_center(cell) for cell in cells])
-    starts = [
-        _Start(tuple(some), cell, float(heatmap[0][cell]))
-        for some, cell in zip(fits, cells, strict=True)
+    fits = coarse_fits(template, scene, [cell_center(cell) for cell in cells])
+    coarse, close = _SAME_POSE
+    poses = [
+        _Pose(fit, cell, float(heatmap[0][cell]))
+        for cell, some in zip(cells, fits, strict=True)
+        for fit in some
     ]
-    few = _apart(sorted(starts, key=lambda start: -start.promise), 2 * count)
-    closer = [_closer(appearance.template, scene, start) for start in few]
-    best = _apart(sorted(closer, key=lambda start: -start.promise), count)
-    return [_candidate(appearance, scene, start) for start in best]
+    some = [_closer(template, scene, one) for one in _different(poses, _CLOSER * count, *coarse)]
+    few = _different(some, _ALIGNED * count, *close)
+    laid = _all_aligned(appearance, scene, few)
+    return [_candidate(appearance, scene, one, laid) for one in _apart(appearance, laid, count)]
 
 
 def best_fit(
@@ -121,8 +145,11 @@ def best_fit(
         The fit, and its lead over that of the opposite way round.
     """
     scene = pyramid_of(frame)
-    start = _Start(tuple(coarse_fits(appearance.template, scene, [near_px])[0]), (0, 0), 0.5)
-    fit, _, lead = _better_way_round(appearance, scene, _closer(appearance.template, scene, start))
+    (fits,) = coarse_fits(appearance.template, scene, [near_px])
+    poses = [_closer(appearance.template, scene, _Pose(fit, (0, 0), 0.5)) for fit in fits]
+    laid = _all_aligned(appearance, scene, poses)
+    best = max(laid, key=lambda one: one.firmness)
+    fit, _, lead = _better_way_round(appearance, scene, best, laid)
     return fit, lead
 
 
@@ -132,38 +159,70 @@ def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
     return float(HALF_CROP_PX + CELL_PX * col), float(HALF_CROP_PX + CELL_PX * row)
 
 
-def _closer(template: Template, scene: Pyramid, start: _Start) -> _Start:
-    least = start.fits[0].score - _NEARLY
-    some = [fit for fit in start.fits[:_TURNS] if fit.score >= least]
-    fits = [middle_fit(template, scene, fit) for fit in some]
-    return replace(start, fits=tuple(sorted(fits, key=lambda fit: -fit.score)))
+def _closer(template: Template, scene: Pyramid, pose: _Pose) -> _Pose:
+    return replace(pose, fit=middle_fit(template, scene, pose.fit))
 
 
-def _candidate(appearance: Appearance, scene: Pyramid, start: _Start) -> Candidate:
-    fit, look, lead = _better_way_round(appearance, scene, start)
-    facts = evidence(appearance.reference, look, fit.scale, start.quality, lead)
+def _all_aligned(appearance: Appearance, scene: Pyramid, poses: Sequence[_Pose]) -> list[_Laid]:
+    """Poses aligned by pixels, the firmest first; a few by edges, too, if none fits well."""
+    laid = []
+    for pose in poses:
+        way = appearance.aligner.aligned(scene, pose.fit)
+        laid.append(_Laid(pose, *way, firmness(appearance.reference, way[1])))
+    laid.sort(key=lambda one: -one.firmness)
+    if max(one.fit.score for one in laid) >= _FITS_WELL:
+        return laid
+    return [_by_edges(appearance, scene, one) for one in laid[:_SNAPPED]] + laid[_SNAPPED:]
+
+
+def _by_edges(appearance: Appearance, scene: Pyramid, laid: _Laid) -> _Laid:
+    """The same pose moved to where its edges are, if it holds more firmly there."""
+    reference, aligner = appearance.reference, appearance.aligner
+    moved = snapped(reference, scene, laid.fit)
+    look = aligner.look(scene, moved)
+    ways = [(replace(moved, score=look.score), look)]
+    again, seen = aligner.aligned(scene, moved)
+    if again.score > look.score + _LEAST_GAIN:
+        ways.append((again, seen))
+    others = [_Laid(laid.pose, *way, firmness(reference, way[1])) for way in ways]
+    return max((laid, *others), key=lambda one: one.firmness)
+
+
+def _candidate(
+    appearance: Appearance, scene: Pyramid, laid: _Laid, others: Sequence[_Laid]
+) -> Candidate:
+    pose = laid.pose
+    fit, look, lead = _better_way_round(appearance, scene, laid, others)
+    facts = evidence(appearance.reference, look, fit.scale, pose.quality, lead)
     center = appearance.center_of(fit)
-    return Candidate(fit, facts, center, cell_center(start.cell), lead, start.quality)
+    return Candidate(fit, facts, center, cell_center(pose.cell), lead, pose.quality)
 
 
 def _better_way_round(
-    appearance: Appearance, scene: Pyramid, start: _Start
+    appearance: Appearance, scene: Pyramid, laid: _Laid, others: Sequence[_Laid]
 ) -> tuple[Fit, Look, float]:
     """The better of the fit and its opposite, laid exactly, and its lead over the other."""
-    first = start.fits[0]
-    found = [other for other in start.fits[1:] if _is_opposite(first, other)]
-    other = found[0] if found else _opposite(appearance, scene, first)
-    fit, look = appearance.aligner.aligned(scene, first)
-    if first.score - other.score > _CLEAR_LEAD:
-        return fit, look, first.score - other.score
-    opposite, its_look = appearance.aligner.aligned(scene, other)
+    fit, look = laid.fit, laid.look
+    found = [one for one in others if _is_opposite(appearance, fit, one.fit)]
+    if found:
+        best = max(found, key=lambda one: one.firmness)
+        opposite, its_look = best.fit, best.look
+    else:
+        start = laid.pose.fit
+        other = _opposite(appearance, scene, start)
+        if start.score - other.score > _CLEAR_LEAD:
+            return fit, look, start.score - other.score
+        opposite, its_look = appearance.aligner.aligned(scene, other)
     if opposite.score > fit.score:
         return opposite, its_look, opposite.score - fit.score
     return fit, look, fit.score - opposite.score
 
 
-def _is_opposite(one: Fit, other: Fit) -> bool:
-    return bool(np.cos(one.turn_rad - other.turn_rad) < -np.cos(_OPPOSITE_RAD))
+def _is_opposite(appearance: Appearance, one: Fit, other: Fit) -> bool:
+    """Whether two fits lie on the same place, the ways round about opposite."""
+    apart = math.dist(appearance.center_of(one), appearance.center_of(other))
+    turned = np.cos(one.turn_rad - other.turn_rad) < -np.cos(_OPPOSITE_RAD)
+    return bool(apart < _SAME_PX and turned)
 
 
 def _opposite(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
@@ -181,14 +240,29 @@ def _laid(fit: Fit, x: float, y: float) -> tuple[float, float]:
     return float(center_x + cos * x + sin * y), float(center_y - sin * x + cos * y)
 
 
-def _apart(starts: Sequence[_Start], count: int) -> list[_Start]:
-    """The first `count` of some starts that are not the same place."""
-    kept: list[_Start] = []
-    for start in starts:
-        x, y = start.fits[0].center_px
-        places = [other.fits[0].center_px for other in kept]
-        if all(np.hypot(x - a, y - b) > _SAME_PX for a, b in places):
-            kept.append(start)
+def _different(poses: Sequence[_Pose], count: int, near_px: float, near_rad: float) -> list[_Pose]:
+    """The `count` most promising poses, none nearly the same as another."""
+    kept: list[_Pose] = []
+    for pose in sorted(poses, key=lambda one: -one.promise):
+        if not any(_nearly_same(pose.fit, other.fit, near_px, near_rad) for other in kept):
+            kept.append(pose)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _nearly_same(one: Fit, other: Fit, near_px: float, near_rad: float) -> bool:
+    alike = np.cos(one.turn_rad - other.turn_rad) > np.cos(near_rad)
+    return bool(alike and math.dist(one.center_px, other.center_px) < near_px)
+
+
+def _apart(appearance: Appearance, laid: Sequence[_Laid], count: int) -> list[_Laid]:
+    """The `count` firmest, no two of the same place."""
+    kept: list[_Laid] = []
+    for one in sorted(laid, key=lambda one: -one.firmness):
+        center = appearance.center_of(one.fit)
+        if all(math.dist(center, appearance.center_of(other.fit)) > _SAME_PX for other in kept):
+            kept.append(one)
         if len(kept) == count:
             break
     return kept

@@ -24,7 +24,9 @@ _SMOOTHED_PX = 2.0
 class Outline:
     """Points along a mask's outline, N of them, and where both sides are."""
 
-    inner: Floats  # (2 N, 2) x, y, near ones first
+    points: Floats  # (N, 2) x, y
+    inward: Floats  # (N, 2), of length 1, across the outline
+    inner: Floats  # (2 N, 2), near ones first
     outer: Floats  # (2 N, 2)
 
     @staticmethod
@@ -37,7 +39,13 @@ class Outline:
         near, far = _NEAR_PX * inward, _FAR_PX * inward
         inner = np.concatenate([points + near, points + far])
         outer = np.concatenate([points - near, points - far])
-        return Outline(inner.astype(np.float32), outer.astype(np.float32))
+        return Outline(*(one.astype(np.float32) for one in (points, inward, inner, outer)))
+
+    def across(self, image: Floats, offsets: Floats) -> Floats:
+        """Colours (N, M, 3) at M offsets [px] from each point, inside ones negative."""
+        at = self.points[:, None] - offsets[:, None] * self.inward[:, None]
+        colours = _sampled(image, at.reshape(-1, 2))
+        return colours.reshape(len(at), len(offsets), -1)
 
     def sides(self, image: Floats) -> tuple[Floats, Floats]:
         """Colours (N, 3) just inside and just outside, in an image (h, w, 3)."""

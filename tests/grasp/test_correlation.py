@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from toys import lay, table, toy
 
+from qsgm.grasp import correlation
 from qsgm.grasp.alignment import as_taught
 from qsgm.grasp.correlation import (
     COARSE,
     FINE,
     NOISE_VARIANCE,
     Fit,
+    Pyramid,
     Template,
+    agreement,
     coarse_fits,
     correlate,
     pyramid_of,
@@ -42,13 +45,15 @@ def test_every_halving_is_the_mean_of_four_pixels_whatever_the_size() -> None:
 def test_windows_are_the_frames_pixels_around_their_centres() -> None:
     scene = pyramid_of(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8))
     windows, places = windows_around(scene, FINE, (203.0, 151.0), 2)
-    assert windows.shape == (25, 3, 64 * 64)
+    assert windows.shape == (13, 3, 64 * 64)  # a diamond: those at most two steps away
     for window, (x, y) in zip(windows, places, strict=True):
         left, top = round((x + 0.5) / 2 - 32), round((y + 0.5) / 2 - 32)
         expected = scene.level(FINE)[top : top + 64, left : left + 64].transpose(2, 0, 1)
         np.testing.assert_array_equal(window, expected.reshape(3, -1))
-    assert np.abs(places[12] - (203, 151)).max() <= 1
-    assert np.ptp(places, axis=0).tolist() == [8, 8]
+    middle = places.mean(axis=0)
+    assert np.abs(middle - (203, 151)).max() <= 1
+    assert len({tuple(place) for place in places.tolist()}) == 13
+    assert np.abs(places - middle).sum(axis=1).max() == 4
 
 
 def test_correlation_is_that_of_the_masked_pixels_each_channel_around_its_mean() -> None:
@@ -68,6 +73,60 @@ def test_correlation_is_that_of_the_masked_pixels_each_channel_around_its_mean()
             )
             expected = both / math.sqrt((own + NOISE_VARIANCE) * (taught + NOISE_VARIANCE))
             assert scores[a, k] == pytest.approx(expected, abs=1e-4)
+
+
+def test_parts_of_a_patch_agree_each_by_its_own_masked_correlation() -> None:
+    rng = np.random.default_rng(2)
+    windows = rng.uniform(0, 255, (3, 3, 16, 16))
+    layer = APPEARANCE.template.layer(COARSE)
+    trials = APPEARANCE.template.trials(COARSE, [(0.0, 1.0)])  # the middle of the layer as it is
+    margin = (len(layer) - 16) // 2
+    middle = layer[margin : margin + 16, margin : margin + 16].astype(float)
+    whole, _, _ = correlate(windows.reshape(3, 3, -1).astype(np.float32), trials)
+    found = agreement(windows.reshape(3, 3, -1).astype(np.float32), trials)
+    for window, one, all_at_once in zip(windows, found, whole, strict=True):
+        apart = 0.0
+        for row, column in np.ndindex(4, 4):
+            here = np.s_[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+            mask = middle[here][..., 3].ravel()
+            if not mask.any():
+                continue
+            a, b = window[:, *here].reshape(3, -1), middle[here][..., :3].reshape(-1, 3).T
+            a, b = (x - (x * mask).sum(axis=1, keepdims=True) / mask.sum() for x in (a, b))
+            both, own, taught = (
+                float((x * y * mask).sum() / mask.sum()) for x, y in ((a, b), (a, a), (b, b))
+            )
+            cosine = both / math.sqrt((own + NOISE_VARIANCE) * (taught + NOISE_VARIANCE))
+            apart += max(cosine, 0.0) * mask.sum() / middle[..., 3].sum()
+        assert one[0] == pytest.approx(all_at_once[0] / 3 + apart * 2 / 3, abs=1e-4)
+
+
+def test_parts_keep_the_turn_of_an_object_that_is_half_hidden_where_one_correlation_loses_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def found() -> float:
+        return float(np.mean([turn_is_among(half_hidden(turn), turn) for turn in TURNS]))
+
+    with_parts = found()
+    monkeypatch.setattr(correlation, "agreement", lambda *both: correlate(*both)[0])
+    assert with_parts > 0.6
+    assert found() < 0.3
+
+
+TURNS = range(0, 360, 20)
+
+
+def half_hidden(turn_deg: float) -> Pyramid:
+    """The object with a bright square over one end."""
+    scene, turn = lay(toy(), table(1), CENTER, turn_deg), math.radians(turn_deg)
+    x, y = round(CENTER[0] - 40 * math.cos(turn)), round(CENTER[1] + 40 * math.sin(turn))
+    scene[y - 25 : y + 25, x - 25 : x + 25] = (240, 250, 30)
+    return pyramid_of(scene)
+
+
+def turn_is_among(scene: Pyramid, turn_deg: float) -> bool:
+    (fits,) = coarse_fits(APPEARANCE.template, scene, [CENTER])
+    return any(turn_error(fit, turn_deg) < 16 for fit in fits)
 
 
 def test_the_demonstration_itself_is_found_where_and_as_it_lies() -> None:
