@@ -31,7 +31,7 @@ _LEAD_SLOPE = 20.0
 LEAST_CONFIDENCE = 0.75
 # Of all instances, at most so many are looked for.
 MOST_INSTANCES = 12
-# Two places whose objects overlap by more (intersection over union) are the same object.
+# Of two places whose objects cover a larger share of the smaller one, the surer one counts.
 _SAME_OVERLAP = 0.3
 _MASK_SHRINK = 4
 
@@ -146,5 +146,5 @@ def _footprint(sighting: Sighting, frame_hw: tuple[int, int]) -> NDArray[np.bool
 
 
 def _overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
-    """Intersection over union."""
-    return float((one & other).sum() / max((one | other).sum(), 1))
+    """Share of the smaller one that both cover."""
+    return float((one & other).sum() / max(min(one.sum(), other.sum()), 1))
