@@ -32,9 +32,9 @@ CELL_PX = 16
 # Cells of the heatmap that the patch is laid over, and how many places are judged.
 PROPOSED, JUDGED = 12, 4
 # For each of these, so many poses are looked at closer, and so many are aligned.
-_CLOSER, _ALIGNED = 3, 2
+_CLOSER, _ALIGNED = 2.5, 1.5
 # Of these at most so many are moved to their edges.
-_SNAPPED = 3
+_SNAPPED = 2
 # What the network's log odds count beside a correlation when poses are chosen.
 _QUALITY_WEIGHT = 0.02
 # Poses closer than that [px, rad] are the same one, by coarse looks and by closer ones.
@@ -130,8 +130,10 @@ def judge(
         for cell, some in zip(cells, fits, strict=True)
         for fit in some
     ]
-    some = [_closer(template, scene, one) for one in _different(poses, _CLOSER * count, *coarse)]
-    few = _different(some, _ALIGNED * count, *close)
+    some = [
+        _closer(template, scene, one) for one in _different(poses, round(_CLOSER * count), *coarse)
+    ]
+    few = _different(some, round(_ALIGNED * count), *close)
     laid = _all_aligned(appearance, scene, few)
     return [_candidate(appearance, scene, one, laid) for one in _apart(appearance, laid, count)]
 
