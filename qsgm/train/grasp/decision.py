@@ -2,7 +2,7 @@
 
 Objects drawn anew are taught, then looked for in scenes with them and without them. A small network
 learns to tell the judged candidates that are the object from those that are not; its threshold is
-what 2 % of the scenes without the object reach.
+what 1 % of the scenes without the object reach.
 """
 
 from collections.abc import Sequence
