@@ -17,7 +17,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import onnxruntime as ort
 from growth.wide import quantized, random_net, random_sgm
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -51,6 +50,9 @@ from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.samples.drawn import HIDDEN, MOST_LATE
 from qsgm.tune.noop_step import noop_step
 from qsgm.weights import to_step_layout
+
+# isort: split
+import onnxruntime as ort  # behind qsgm, which keeps it from reporting home
 
 CLASSES = 8
 HEADS = (Head("class", "cross_entropy", CLASSES, "softmax"),)

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 from rich.console import Console
@@ -33,6 +32,9 @@ from qsgm.schedule import batches, rate_factor, steps_per_epoch
 from qsgm.tune.plan import Plan, resolve
 from qsgm.tune.prepare import Prepared, validate
 from qsgm.tune.settings import Settings
+
+# isort: split
+import onnxruntime as ort  # behind qsgm, which keeps it from reporting home
 
 Arrays = dict[str, NDArray]
 Run = Callable[[Arrays], Arrays]

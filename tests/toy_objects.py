@@ -35,7 +35,7 @@ def hook() -> NDArray[np.float32]:
     return picture
 
 
-def teach(folder: Path, name: str, picture: NDArray[np.float32], threshold: float = 0.6) -> Path:
+def teach(folder: Path, name: str, picture: NDArray[np.float32], threshold: float = 0.8) -> Path:
     """Keep an object in a folder; it is found where its patch correlates as well as that."""
     center = (320.0, 240.0)
     patch = cut_patch(lay(picture, table(), center), center)

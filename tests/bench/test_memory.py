@@ -185,7 +185,7 @@ def test_bench_memory_runs_from_the_command_line(
     assert cv2.imread(str(picture)) is not None
 
 
-@pytest.mark.parametrize("counts", ["7", "0", "3;6", "x", "3,"])
+@pytest.mark.parametrize("counts", ["65", "0", "3;6", "x", "3,"])
 def test_numbers_of_layers_that_are_none_are_refused(
     counts: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -193,6 +193,13 @@ def test_numbers_of_layers_that_are_none_are_refused(
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert "--processes" in message
+
+
+def test_more_layers_than_the_bundle_has_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["bench", "memory", "--processes", "7"]) == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "cannot tune the last 7 layers: choose 1 to 6" in message
 
 
 @pytest.mark.parametrize("library", ["onnx", "matplotlib"])

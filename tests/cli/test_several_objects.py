@@ -96,7 +96,7 @@ def test_a_place_that_look_alikes_claim_is_the_surer_ones(qsgm: Run, scene: Path
     twin = toy()
     cv2.circle(twin, (270, 240), 28, (20, 30, 60, 255), cv2.FILLED)
     teach(paths.folder_named("twin"), "twin", twin)
-    write_png(scene, lay(toy(), table(3), TOY_AT, TURN_DEG))
+    write_png(scene, both_on_a_table())
     alone = qsgm("predict", "--json", "--object", "twin", scene).json
     assert alone["found"]
     assert math.dist(alone["center_px"], TOY_AT) < 3

@@ -130,12 +130,12 @@ def test_without_a_stdout_the_video_is_written_all_the_same(belt: Path, tmp_path
 
 
 def test_any_distance_finds_what_predict_finds_at_another_one(qsgm: Run, tmp_path: Path) -> None:
-    paths.remember_object(teach(paths.folder_named("toy"), "toy", toy(), 0.85))
-    picture = tmp_path / "far.png"
-    write_png(picture, lay(toy(), table(4), TOY_AT, 40, 0.5))
+    paths.remember_object(teach(paths.folder_named("toy"), "toy", toy()))
+    picture, middle = tmp_path / "near.png", (300.0, 240.0)
+    write_png(picture, lay(toy(), table(4), middle, 40, 2.2))
     (here,) = json.loads(qsgm("watch", picture).out)["objects"]
-    (far,) = json.loads(qsgm("watch", picture, "--any-distance").out)["objects"]
-    assert [here["found"], far["found"]] == [False, True]
-    assert far["center_px"] == pytest.approx(TOY_AT, abs=3)
+    (near,) = json.loads(qsgm("watch", picture, "--any-distance").out)["objects"]
+    assert [here["found"], near["found"]] == [False, True]
+    assert near["center_px"] == pytest.approx(middle, abs=3)
     told = qsgm("predict", "--json", "--any-distance", picture).json
-    assert {key: told[key] for key in far} == far
+    assert {key: told[key] for key in near} == near

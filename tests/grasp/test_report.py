@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console, RenderableType
 
+from qsgm.blocks import parse_blocks
 from qsgm.fidelity import LayerFidelity
 from qsgm.grasp.heatmap import Detection
 from qsgm.grasp.report import detection_table, instances_table, turn_text
@@ -95,16 +96,19 @@ def test_what_was_shown_is_told_as_json() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "blocks", "said"),
     [
-        (Settings(epochs=3), "mug: last 3 layers, sgm float, 3 epochs"),
-        (Settings(precision="int8", epochs=20), "mug: last 3 layers, sgm int8, 20 epochs"),
-        (Settings(method="bp", layers=2, epochs=1), "mug: last 2 layers, bp, 1 epochs"),
-        (Settings(blocks="4,5-6", epochs=1), "mug: blocks 4,5-6, sgm float, 1 epochs"),
+        (Settings(epochs=3), "4,5,6", "mug: last 3 layers, sgm float, 3 epochs"),
+        (Settings(precision="int8", epochs=20), "4,5,6", "mug: last 3 layers, sgm int8, 20 epochs"),
+        (Settings(method="bp", layers=2, epochs=1), "5-6", "mug: last 2 layers, bp, 1 epochs"),
+        (Settings(blocks="4,5-6", epochs=1), "4,5-6", "mug: blocks 4,5-6, sgm float, 1 epochs"),
     ],
 )
-def test_a_runs_title_says_what_was_tuned_and_how(settings: Settings, said: str) -> None:
-    result: Any = SimpleNamespace(plan=SimpleNamespace(settings=settings))
+def test_a_runs_title_says_what_was_tuned_and_how(
+    settings: Settings, blocks: str, said: str
+) -> None:
+    plan = SimpleNamespace(settings=settings)
+    result: Any = SimpleNamespace(plan=plan, blocks=parse_blocks(blocks, 6))
     assert run_title(result, "mug") == said
 
 
