@@ -13,7 +13,7 @@ PACKAGED := pyproject.toml README.md $(shell find qsgm calib export -type f -not
 
 TIMES ?= 50
 
-.PHONY: help demo test robustness mutants lint format clean
+.PHONY: help demo test robustness mutants versions lint format clean
 .DEFAULT_GOAL := help
 
 help:  ## show these lines
@@ -36,6 +36,9 @@ mutants: .venv-test/installed  ## do the tests bite? an hour of a core; goes on 
 	.venv-test/bin/python $(PIP) coverage
 	test -f mutants/coverage || .venv-test/bin/python benchmarks/mutants collect
 	.venv-test/bin/python benchmarks/mutants run
+
+versions: .venv-test/installed  ## the device side's tests on old and new versions, without torch
+	benchmarks/versions.sh
 
 lint: .venv-test/installed  ## check style and formatting
 	.venv-test/bin/ruff check .

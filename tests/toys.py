@@ -117,3 +117,25 @@ def with_decision(bundle: Bundle, decision: Decision) -> Bundle:
     settings = {**task.settings, "decision": decision.to_json()}
     manifest = replace(bundle.manifest, task=replace(task, settings=settings))
     return replace(bundle, manifest=manifest)
+
+
+def draw_frame(length: int = 90) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A bar (or, of length 0, a disk) on a noisy table, and its mask."""
+    rng = np.random.default_rng(0)
+    table = np.array([120, 140, 160]) + cv2.GaussianBlur(
+        rng.normal(0, 60, (480, 640, 3)), (0, 0), 3
+    )
+    mask = np.zeros((480, 640), np.uint8)
+    along = np.array([np.cos(0.4), -np.sin(0.4)]) * length / 2
+    ends = [tuple(int(v) for v in np.rint(np.array([320, 240]) + s * along)) for s in (-1, 1)]
+    cv2.line(mask, ends[0], ends[1], 255, 26, cv2.LINE_AA)
+    table[mask > 127] = (40, 60, 200)
+    return np.clip(table, 0, 255).astype(np.uint8), np.where(mask > 127, 255, 0).astype(np.uint8)
+
+
+def draw_things() -> NDArray[np.uint8]:
+    """A sheet of two things, a green bar and a blue disk: (128, 256, 4) BGRA."""
+    sheet = np.zeros((128, 256, 4), np.uint8)
+    cv2.rectangle(sheet, (24, 52), (104, 76), (60, 200, 40, 255), cv2.FILLED)
+    cv2.circle(sheet, (192, 64), 30, (220, 90, 30, 255), cv2.FILLED)
+    return sheet

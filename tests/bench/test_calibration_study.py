@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
+from toys import draw_frame
 
 from qsgm import QsgmError, cli
 from qsgm.bench import calibration
@@ -46,7 +47,6 @@ from qsgm.tune.prepare import Prepared
 from qsgm.tune.probe import activations_of
 from qsgm.tune.run import Keeper, train, tune
 from qsgm.tune.settings import Settings
-from tests.conftest import draw_frame
 
 SHORT = Settings(precision="int8", epochs=1)
 TWO = (Variant(16, 16, "minmax"), Variant(8, 8, "percentile"))

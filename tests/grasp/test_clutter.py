@@ -5,8 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from conftest import draw_things
 from numpy.typing import NDArray
+from toys import draw_things
 
 from qsgm.grasp import clutter
 from qsgm.grasp.clutter import Addition, plan_clutter
