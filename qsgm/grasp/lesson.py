@@ -101,7 +101,8 @@ class GraspLesson:
         known = np.array([0.0 if turn is None else turn for turn in turns])
         alike = np.array([turn is not None for turn in turns])
         # In float32 arctan2's last bits are the processor's own.
-        seen = decode_angle(*outputs[:, 1:].T.astype(np.float64), self.encoding)
+        sine, cosine = outputs[:, 1].astype(np.float64), outputs[:, 2].astype(np.float64)
+        seen = decode_angle(sine, cosine, self.encoding)
         lying = seen - crops.plan.turn_rad - known[crops.shown]
         # Held-out crops have no say in it.
         taught = (crops.plan.quality > 0) & (np.arange(len(crops)) < self.taught)
