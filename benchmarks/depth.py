@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from growth.wide import quantized, random_net, random_sgm
@@ -34,10 +33,10 @@ from qsgm.bench.charts import (
     style,
     write_chart,
 )
-from qsgm.bench.timing import Job
+from qsgm.bench.timing import median_seconds
 from qsgm.blocks import Blocks, one_block, single_layers
 from qsgm.network import Network, conv
-from qsgm.runtime import session_options
+from qsgm.runtime import open_session
 from qsgm.schedule import BATCH
 from qsgm.sgm.float import FoldedSgm
 from qsgm.tables import CLOSE, number, table
@@ -112,10 +111,11 @@ def measure(network: Network, repeats: int, threads: int) -> dict[str, Any]:
             files[name].write_bytes(model.SerializeToString())
         peaks = {name: peak_of(file, net, steps[name][0], threads) for name, file in files.items()}
         jobs = {
-            name: noop_step(opened(file, threads), start_of(net), steps[name][0])
+            name: noop_step(open_session(file.read_bytes(), threads), start_of(net), steps[name][0])
             for name, file in files.items()
         }
-        ms = {name: 1000 * one for name, one in median_cpu_seconds(jobs, repeats).items()}
+        seconds = median_seconds(jobs, repeats, time.process_time)
+        ms = {name: 1000 * one for name, one in seconds.items()}
     told = {
         name: {
             "ms": number(ms[name], 4),
@@ -126,23 +126,6 @@ def measure(network: Network, repeats: int, threads: int) -> dict[str, Any]:
         for name in steps
     }
     return {"groups": str(groups), "steps": told}
-
-
-def median_cpu_seconds(jobs: Mapping[str, Job], repeats: int) -> dict[str, float]:
-    """Of each job, on all threads; they take turns."""
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for turn in range(-1, repeats):  # the first turn allocates and does not count
-        for name, job in jobs.items():
-            began = time.process_time()
-            job()
-            if turn >= 0:
-                times[name].append(time.process_time() - began)
-    return {name: median(some) for name, some in times.items()}
-
-
-def opened(file: Path, threads: int) -> ort.InferenceSession:
-    """A session of a graph."""
-    return ort.InferenceSession(str(file), session_options(threads), ["CPUExecutionProvider"])
 
 
 def start_of(net: FoldedNet) -> dict[str, Any]:
