@@ -269,22 +269,31 @@ static void write_file(const char *name, const File *file) {
         fail("cannot write %s: %s", path, strerror(errno));
 }
 
+static void begin(const char *folder) {
+    int length = snprintf(unfinished, PATH_BYTES, "%s.XXXXXX", folder);
+    if (length >= PATH_BYTES)
+        errno = ENAMETOOLONG;
+    if (length >= PATH_BYTES || !mkdtemp(unfinished)) {
+        *unfinished = 0;
+        fail("cannot write beside %.200s: %s", folder, strerror(errno));
+    }
+}
+
+/* Before any work: whether an object can appear there. */
 void check_new(const char *folder) {
     struct stat about;
     if (!lstat(folder, &about))
         fail("cannot write %s: it is there already; pass a new name or remove it", folder);
+    begin(folder);
+    remove_unfinished();
+    *unfinished = 0;
 }
 
 /* The folder appears whole or not at all. */
 void write_object(const char *folder, const char *name, const Object *object) {
     char digits[65], lines[1024], sums[256];
     File description = {0, (uint8_t *)lines}, listing = {0, (uint8_t *)sums};
-    join(unfinished, folder, "");
-    snprintf(unfinished + strlen(unfinished) - 1, 8, ".XXXXXX");
-    if (!mkdtemp(unfinished)) {
-        *unfinished = 0;
-        fail("cannot write beside %s: %s", folder, strerror(errno));
-    }
+    begin(folder);
     atexit(remove_unfinished);
     digest(&object->network, digits);
     description.size = (size_t)snprintf(lines, sizeof lines,

@@ -64,10 +64,11 @@ static void look(const char *folder, const Frame *frame) {
 
 int main(int count, char **arguments) {
     Settings set = {.epochs = 20, .name = "object"};
-    const char *raw_size = NULL, *given[4] = {NULL}, *middle = NULL;
+    const char *raw_size = NULL, *middle = NULL;
+    char *given[4] = {NULL};
     int known = 0;
     for (int i = 1; i < count; i++) {
-        const char *one = arguments[i], *value = i + 1 < count ? arguments[i + 1] : "";
+        char *one = arguments[i], *value = i + 1 < count ? arguments[i + 1] : "";
         int takes_value = 1;
         if (!strcmp(one, "--int8"))
             set.int8 = 1, takes_value = 0;
@@ -91,6 +92,9 @@ int main(int count, char **arguments) {
     if (!teaching && !(known == 3 && !strcmp(given[0], "predict")))
         misused();
     check_name(set.name);
+    if (teaching)
+        for (size_t last = strlen(given[3]); last > 1 && given[3][last - 1] == '/'; last--)
+            given[3][last - 1] = 0;
     Frame frame = read_frame(given[2], raw_size);
     double center[2] = {frame.width / 2.0, frame.height / 2.0};
     if (middle) {

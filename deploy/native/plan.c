@@ -1,8 +1,6 @@
 /* One frame becomes 1000 labelled crops, the very bytes that the Python side cuts.
 
-   All that is random is drawn first. The arithmetic is OpenCV 5's: coordinates and blending in
-   float32 with fused products (of a row's last pixels in another order), colours in 10-bit fixed
-   point. */
+   All that is random is drawn first. */
 #include "qsgm.h"
 
 #include <math.h>

@@ -241,11 +241,14 @@ const takeScene = scene.takes($("look"), doing, async (image) => {
 $("again").addEventListener("click", () => takeScene(examples[1]));
 $("live").addEventListener("click", doing(async () => {
   $("answer").ariaLive = "off"; // many a second are too many to be read out
-  await scene.film($("live"), async (image) => {
-    await find(image);
-    say("Live.");
-  });
-  $("answer").ariaLive = "polite";
+  try {
+    await scene.film($("live"), async (image) => {
+      await find(image);
+      say("Live.");
+    });
+  } finally {
+    $("answer").ariaLive = "polite";
+  }
 }));
 
 // ---- keep it

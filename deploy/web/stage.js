@@ -64,9 +64,13 @@ export class Stage {
     this.button = button;
     this.label = button.textContent;
     button.textContent = "Stop the camera";
-    while (this.video.srcObject) {
-      await see(pixelsOf(this.video));
-      await new Promise(requestAnimationFrame);
+    try {
+      while (this.video.srcObject) {
+        await see(pixelsOf(this.video));
+        await new Promise(requestAnimationFrame);
+      }
+    } finally {
+      this.stop();
     }
   }
 

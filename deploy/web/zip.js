@@ -56,7 +56,7 @@ export async function unzipped(zip) {
   while (end >= 0 && view.getUint32(end, true) !== END) end--;
   if (end < 0) throw new Error("This is no zip file.");
   const files = {};
-  let at = view.getUint32(end + 16, true);
+  let [at, room] = [view.getUint32(end + 16, true), MOST_BYTES];
   for (let left = view.getUint16(end + 10, true); left > 0; left--) {
     if (view.getUint32(at, true) !== CENTRAL) throw new Error("The zip file is damaged.");
     const [method, size, full] = [view.getUint16(at + 10, true), view.getUint32(at + 20, true),
@@ -65,15 +65,29 @@ export async function unzipped(zip) {
     const start = view.getUint32(at + 42, true);
     const name = new TextDecoder().decode(zip.subarray(at + 46, at + 46 + lengths[0]));
     const data = start + 30 + view.getUint16(start + 26, true) + view.getUint16(start + 28, true);
-    if (full > MOST_BYTES) throw new Error("The zip file holds more than an object.");
+    room -= full;
+    if (room < 0) throw tooMuch();
     const bytes = zip.subarray(data, data + size);
-    if (!name.endsWith("/")) files[name.split("/").pop()] = method ? await inflated(bytes) : bytes;
+    if (!name.endsWith("/")) files[name.split("/").pop()] = method ? await inflated(bytes, full) : bytes;
     at += 46 + lengths[0] + lengths[1] + lengths[2];
   }
   return files;
 }
 
-async function inflated(bytes) {
+/** What was packed, if it is as large as it was said to be. */
+async function inflated(bytes, size) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
+  const whole = new Uint8Array(size);
+  let done = 0;
+  for (const reader = stream.getReader(); ;) {
+    const { value } = await reader.read();
+    if (!value) break;
+    if (done + value.length > size) throw tooMuch();
+    whole.set(value, done);
+    done += value.length;
+  }
+  if (done < size) throw new Error("The zip file is damaged.");
+  return whole;
 }
+
+const tooMuch = () => new Error("The zip file holds more than an object.");

@@ -285,16 +285,43 @@ def test_nothing_is_written_into_the_users_folders(
     assert [*tmp_path.iterdir()] == []
 
 
-def test_broken_files_do_not_crash_it(
-    slim: Bundle, own: Path, frame: Frame, tmp_path_factory: pytest.TempPathFactory
+@pytest.fixture(scope="module")
+def sanitized(tmp_path_factory: pytest.TempPathFactory) -> Program:
+    return build(tmp_path_factory.mktemp("sanitized"), SANITIZE)
+
+
+@pytest.mark.parametrize("place", ["none/object", "long"])
+def test_where_nothing_can_appear_is_refused_before_any_work(
+    sanitized: Program, slim: Bundle, ppm: Path, tmp_path: Path, place: str
 ) -> None:
-    program = build(tmp_path_factory.mktemp("sanitized"), SANITIZE)
+    room = 4094 - len(f"{tmp_path}/") - len(place)  # just short of what a path may have
+    steps = "./" * (room // 2) if place == "long" else ""
+    target = f"{tmp_path}/{steps}{place}"
+    refused(sanitized("finetune", slim.folder, ppm, target), "cannot write beside")
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_folder_may_be_named_with_a_slash_at_its_end(
+    native: Program, slim: Bundle, ppm: Path, tmp_path: Path
+) -> None:
+    done = native("finetune", "--epochs", 1, slim.folder, ppm, f"{tmp_path}/object/")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["object"]
+
+
+def test_broken_files_do_not_crash_it(
+    sanitized: Program,
+    slim: Bundle,
+    own: Path,
+    frame: Frame,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     material = tmp_path_factory.mktemp("material")
     shutil.copytree(slim.folder, material / "bundle")
     shutil.copytree(own, material / "object")
     cv2.imwrite(str(material / "frame.ppm"), frame[100:400, 150:450])
     times = int(os.environ.get("QSGM_ROBUSTNESS", "1"))
-    command = [sys.executable, Path(__file__).with_name("native_inputs.py"), program.path]
+    command = [sys.executable, Path(__file__).with_name("native_inputs.py"), sanitized.path]
     done = subprocess.run(
         [*map(str, command), str(material), "0", str(FUZZED * times)],
         capture_output=True,

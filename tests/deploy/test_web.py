@@ -239,6 +239,18 @@ def test_what_is_no_object_is_refused(what: str, shipped: Bundle, tmp_path: Path
     assert expected.get(what, "describes no object") in refused
 
 
+@needs_node
+@pytest.mark.parametrize("said", [10, 80 * 2**20])
+def test_a_zip_that_holds_more_than_it_says_or_may_is_refused(said: int, tmp_path: Path) -> None:
+    path = tmp_path / "object.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as zipped:
+        zipped.writestr("object.json", bytes(1000))
+    size, data = (1000).to_bytes(4, "little"), path.read_bytes()
+    assert data.count(size) == 2  # in the file's own head and in the list of all
+    path.write_bytes(data.replace(size, said.to_bytes(4, "little")))
+    assert run_job(tmp_path, runtime=False, open=[path])["refused"].startswith("The zip file holds")
+
+
 @needs_ort
 def test_what_is_built_is_all_that_the_page_names(tmp_path: Path) -> None:
     dist = built(tmp_path)
