@@ -1,7 +1,8 @@
 #!/bin/sh
 # One lesson on 64-bit Arm, emulated, beside the same here: what differs. `benchmarks/arm64.sh FOLDER
 # [EPOCHS]` on Debian 12 x86-64; nothing is installed. Debian's Python for Arm runs in qemu, with the
-# wheels that a board gets. ONNX Runtime 1.24.1, since 1.32.0 ends in qemu 7.2 while it is imported.
+# wheels that a board gets, and the same versions on both sides. ONNX Runtime 1.24.1, since 1.32.0 ends
+# in qemu 7.2 while it is imported.
 set -eu
 
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -31,8 +32,12 @@ for package in numpy==2.4.6 onnxruntime==1.24.1 opencv-python-headless==5.0.0.93
 done
 for wheel in wheels/*.whl; do "$python" -m zipfile -e "$wheel" site; done
 
+"$python" -m venv same
+same/bin/python -m pip install --disable-pip-version-check --quiet numpy==2.4.6 onnxruntime==1.24.1 \
+    opencv-python-headless==5.0.0.93 typer==0.28.0 rich
+
 lesson=$here/benchmarks/one_lesson.py
-PYTHONPATH=$here "$python" "$lesson" here.npz "$epochs"
+PYTHONPATH=$here same/bin/python "$lesson" here.npz "$epochs"
 PYTHONPATH=$work/site:$here host/usr/bin/qemu-aarch64-static -L root \
     root/usr/bin/python3.11 "$lesson" arm.npz "$epochs"
 PYTHONPATH=$here "$python" "$lesson" here.npz arm.npz

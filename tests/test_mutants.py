@@ -2,12 +2,17 @@
 
 import ast
 import importlib
+import importlib.util
+import json
 import sys
+import tomllib
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+
+from qsgm import load_bundle
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "mutants"
 SOURCE = '''"""A module."""
@@ -103,3 +108,41 @@ def test_a_loaded_function_is_given_a_mutants_code(
         function.__code__ = function_code
     counter = counting.Counter()
     assert (counter.twice, counter.more, counting.place(3)) == (12, True, None)
+
+
+@pytest.fixture
+def mutation(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The program itself; what covers lines is not needed to ask it."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setitem(sys.modules, "covering", ModuleType("covering"))
+    spec = importlib.util.spec_from_file_location("mutation", FOLDER / "__main__.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "mutation", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_copied_tree_has_all_that_tests_import(mutation: ModuleType) -> None:
+    settings = tomllib.loads((FOLDER.parents[1] / "pyproject.toml").read_text())
+    paths = settings["tool"]["pytest"]["ini_options"]["pythonpath"]
+    assert {Path(path).parts[0] for path in paths} <= set(mutation.NEEDED)
+
+
+def test_the_shared_bundle_is_a_whole_one(mutation: ModuleType, tmp_path: Path) -> None:
+    assert mutation._write_bundle(tmp_path / "bundle") == 0
+    assert load_bundle(tmp_path / "bundle").manifest.files
+
+
+def test_what_survived_is_tried_again_where_it_has_to_be_loaded_anew(
+    mutation: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first of two survivors was tried with everything loaded, the other could not be."""
+    entries = [{"mutant": name, "result": "survived"} for name in ("one", "other", "one")]
+    (tmp_path / "log").write_text("".join(f"{json.dumps(entry)}\n" for entry in entries))
+    trials = [SimpleNamespace(mutant=SimpleNamespace(name=name)) for name in ("one", "other")]
+    tried: list[str] = []
+    monkeypatch.setattr(mutation, "_tell", lambda _work, trial, _: tried.append(trial.mutant.name))
+    mutation._try_all(trials, tmp_path, True, 2)
+    assert tried == ["other"]

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).resolve().parent
 TREE = HERE.parents[1]
-NEEDED = ("qsgm", "tests", "benchmarks", "examples", "docs", "calib", "export")
+NEEDED = ("qsgm", "tests", "benchmarks", "examples", "deploy", "docs", "calib", "export")
+FETCHED = ("node_modules", "build")
 # Of CPU that a mutant may take before it counts as endless.
 MOST_SECONDS = 60
 MOST_BYTES = 16 * 2**30
@@ -76,7 +77,7 @@ def collect(work: Path) -> None:
         if path.is_file():
             shutil.copy(path, tree)
         elif path.name in NEEDED:
-            shutil.copytree(path, tree / path.name)
+            shutil.copytree(path, tree / path.name, ignore=shutil.ignore_patterns(*FETCHED))
     settings = work / "coveragerc"
     settings.write_text(
         f"[run]\ninclude = {tree}/qsgm/*\nparallel = true\ndata_file = {work}/coverage\n"
@@ -96,7 +97,9 @@ def collect(work: Path) -> None:
         ["combine", f"--rcfile={settings}"],
     ):
         # That some of them fail under coverage is no matter: those are left out.
-        subprocess.run([*command, *arguments], cwd=tree, env=environment, check=False)
+        done = subprocess.run([*command, *arguments], cwd=tree, env=environment, check=False)
+        if done.returncode not in (0, 1):
+            raise SystemExit(f"{arguments[0]}: exit code {done.returncode}, nothing was collected")
 
 
 def drawn(tree: Path, seed: int, count: int) -> list[Mutant]:
@@ -129,10 +132,14 @@ def run(
             trials.append(Trial(mutant, tests, makes))
     _load(tree)
     os.chdir(tree)
+    if not (work / "bundle").exists() and _code_of(lambda: _write_bundle(work / "bundle"), 600):
+        shutil.rmtree(work / "bundle", ignore_errors=True)
+        raise SystemExit("the bundle that most tests share could not be written")
+    since = len(_lines(log))
     # Those of functions first, in a process that has everything loaded; what it could not try, as
     # it is of a module or a class, in processes that load it anew.
     for loads_anew in (False, True):
-        _code_of(lambda anew=loads_anew: _try_all(trials, work, anew), 10**6)
+        _code_of(lambda anew=loads_anew: _try_all(trials, work, anew, since), 10**6)
 
 
 def _chosen(covered: "Covered", mutant: Mutant, most_seconds: float) -> list[str]:
@@ -208,17 +215,15 @@ def _tested(session: Any, items: list[Any], patch: Any = None) -> int:
     return 0
 
 
-def _try_all(trials: Sequence[Trial], work: Path, loads_anew: bool) -> int:
-    """With everything loaded, or one after the other in processes that load the mutant."""
+def _try_all(trials: Sequence[Trial], work: Path, loads_anew: bool, since: int) -> int:
+    """With everything loaded; or in processes that load them, those not in the log since a line."""
     import pytest
 
     options = ["-q", "-s", "-p", "no:cacheprovider", "--tb=line"]
-    if not (work / "bundle").exists():
-        _code_of(lambda: _write_bundle(work / "bundle"), 600)
     if not loads_anew:
         tests = sorted({name for trial in trials for name in trial.tests})
         return pytest.main([*options, *tests], [Session(trials, work, loads_anew)])
-    left = [one for one in trials if one.mutant.name not in _results(work / "log")]
+    left = [one for one in trials if one.mutant.name not in _results(work / "log", since)]
     for trial in left:
         plugin = Session([trial], work, loads_anew)
         _tell(work, trial, lambda p=plugin: pytest.main([*options, *p._trials[0].tests], [p]))
@@ -228,7 +233,7 @@ def _try_all(trials: Sequence[Trial], work: Path, loads_anew: bool) -> int:
 def _write_bundle(folder: Path) -> int:
     sys.path[:0] = ["tests"]
     folder.mkdir()
-    importlib.import_module("conftest").write_bundle(folder)
+    importlib.import_module("random_bundle").write_bundle(folder)
     return 0
 
 
@@ -286,10 +291,13 @@ def _code_of(job: Callable[[], int], most_seconds: int) -> int:
         os._exit(code)
 
 
-def _results(log: Path) -> dict[str, dict[str, Any]]:
-    """The last word on every mutant."""
-    lines = log.read_text().splitlines() if log.exists() else []
-    return {entry["mutant"]: entry for entry in map(json.loads, lines)}
+def _lines(log: Path) -> list[str]:
+    return log.read_text().splitlines() if log.exists() else []
+
+
+def _results(log: Path, since: int = 0) -> dict[str, dict[str, Any]]:
+    """The last word on every mutant, of what the log has from a line on."""
+    return {entry["mutant"]: entry for entry in map(json.loads, _lines(log)[since:])}
 
 
 def equivalent() -> dict[str, str]:

@@ -344,7 +344,8 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
     rates = {str(single_layers(GRASPNET.last(tuned))): (1e-4,) * tuned for tuned in range(1, 6)}
     of_five = prepare(Checkpoint(task_record(TASK), ConvNet(GRASPNET).eval(), sgms, {}, rates, {}))
     frames = lessons_in(folder)
-    ranges = calibrate(of_five, frames, 0, ignore, EPOCHS, "minmax").ranges
+    done = calibrate(of_five, frames, 0, ignore, EPOCHS, "minmax")
+    ranges = done.ranges
     whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS, "minmax").ranges
     for layer in (4, 5):  # as if there were no others
         np.testing.assert_array_equal(ranges[layer].input_high, whole[layer].input_high)
@@ -365,6 +366,9 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
     int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in of_five.sgms.items()}
     fidelity = measure(of_five, int8, frames, 0, ignore, EPOCHS)
     assert set(fidelity) == {2, 3, 4, 5}
+    # The runs with maps, taken once and looked at again, say the same.
+    assert sorted(done.looks) == [0, 1]
+    assert measure(of_five, int8, frames, 0, ignore, EPOCHS, looks=done.looks) == fidelity
     for layer in (2, 3):
         assert fidelity[layer].cos_int8_float > 0.999
         assert fidelity[layer].clipped_fraction < 1e-3
