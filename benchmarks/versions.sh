@@ -2,7 +2,8 @@
 # The device side's tests on the oldest and the newest versions that pyproject.toml admits, on every
 # Python that is here, from an installed wheel and without torch. `benchmarks/versions.sh [PYTHON ...]`;
 # the interpreters default to those of 3.11, 3.12 and 3.13 on the path. $TESTS: pytest's arguments.
-# One line for each environment at the end. $HOST_PYTHON has torch, and writes the bundle they use.
+# One line for each environment at the end. $HOST_PYTHON has torch, and writes the bundle they use. Old
+# versions may call each other by deprecated names.
 set -eu
 
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -44,7 +45,7 @@ names = ("onnxruntime", "numpy", "opencv-python-headless", "typer", "rich")
 print(sys.version.split()[0], *(f"{name} {m.version(name)}" for name in names), sep=", ")')
         # shellcheck disable=SC2086
         (cd "$work/elsewhere" && QSGM_TEST_BUNDLE=$work/bundle "$venv/bin/python" -m pytest -q \
-            -p no:cacheprovider ${TESTS:-}) > "$venv/log" 2>&1 && status=0 || status=$?
+            -p no:cacheprovider -W default::DeprecationWarning ${TESTS:-}) > "$venv/log" 2>&1 && status=0 || status=$?
         tried=$((tried + 1))
         [ $status = 0 ] || broken=$((broken + 1))
         echo "$versions: exit code $status, $(tail -n 1 "$venv/log")" | tee -a "$summary"

@@ -27,7 +27,7 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle, load_bundle
     from qsgm.fidelity import LayerFidelity
-    from qsgm.grasp.heatmap import Detection, Place
+    from qsgm.grasp.heatmap import Detection
     from qsgm.grasp.others import Other, other_in
     from qsgm.grasp.source import Demonstration
     from qsgm.grasp.taught import FinetuneResult
@@ -62,7 +62,6 @@ else:
         "Lesson": "qsgm.task",
         "Network": "qsgm.network",
         "Other": "qsgm.grasp.others",
-        "Place": "qsgm.grasp.heatmap",
         "Plan": "qsgm.tune.plan",
         "Prepared": "qsgm.tune.prepare",
         "Probe": "qsgm.tune.probe",
@@ -109,7 +108,6 @@ __all__ = [
     "Lesson",
     "Network",
     "Other",
-    "Place",
     "Plan",
     "Prepared",
     "Probe",

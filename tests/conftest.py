@@ -42,7 +42,7 @@ GIVEN_BUNDLE = "QSGM_TEST_BUNDLE"
 
 def needs(file: Path, missing: set[str]) -> bool:
     """Whether a test or what it imports of its neighbours imports one of some packages."""
-    neighbours = {one.stem: one for one in HERE.glob("*.py")}
+    neighbours = {one.stem: one for at in (HERE, file.parent) for one in at.glob("*.py")}
     for module in imported(file):
         if module.split(".")[0] in missing or module.startswith("qsgm.train"):
             return True

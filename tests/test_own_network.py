@@ -187,6 +187,10 @@ def test_gradients_can_be_compared_along_one_run(
     every = printed(capsys, "fidelity", *own, "--layers", 4, "--epochs", 1, path)
     assert [*every["fidelity"]] == ["1", "3"]
     assert "--center concerns" in refused(capsys, "fidelity", *own, "--center", "1,1", path)
+    (tmp_path / "one.py").write_text(FILE.read_text().replace("(DIGIT,))", "(DIGIT,), tuned=1)"))
+    one = ["--bundle", made / "mine", "--task", tmp_path / "one.py"]
+    nothing = tmp_path / "no_samples.npz"  # it is not even read
+    assert "one layer has no SGM" in refused(capsys, "fidelity", *one, nothing)
     assert "pass --task FILE.py" in refused(capsys, "fidelity", *own[:2], path)
     assert "choose 1 to 4" in refused(capsys, "finetune", *own, "--layers", 7, path)
 

@@ -262,7 +262,9 @@ def test_a_recording_without_labels_or_of_too_few_windows_is_refused_in_one_line
     task = RecordedTask("mine", NETWORK, HEADS, overlap=2)
     few, enough = (Samples(inputs(count), labels(np.arange(count))) for count in (3, 4))
     assert task.lesson([enough], np.random.default_rng(0)).taught == 1
-    assert "has 3 windows, expected 4" in refused(lambda: task.lesson([enough, few], RNG))
+    said = refused(lambda: task.lesson([enough, few], RNG))
+    assert "has 3 windows, expected labelled ones, more than the last fifth" in said
+    assert "and 2 before it" in said
     unlabelled = Samples(enough.inputs)
     assert "has no labels" in refused(lambda: task.lesson([enough, unlabelled], RNG))
     assert "nothing was shown" in refused(lambda: task.lesson([], RNG))

@@ -40,6 +40,15 @@ def toy(front: bool = True) -> NDArray[np.float32]:
     return picture
 
 
+def plain() -> NDArray[np.float32]:
+    """A spanner's outline of one colour, 90 px long: nothing on it says where it is."""
+    picture = np.zeros((SIDE, SIDE, 4), np.float32)
+    middle, steel = SIDE // 2, (200, 205, 210, 255)
+    cv2.rectangle(picture, (middle - 170, middle - 22), (middle + 170, middle + 22), steel, -1)
+    cv2.circle(picture, (middle + 150, middle), 52, steel, cv2.FILLED)
+    return picture
+
+
 def table(seed: int = 0, frame_hw: tuple[int, int] = (480, 640), grey: float = 120) -> Frame:
     """A grey table with grain."""
     rng = np.random.default_rng(seed)

@@ -55,6 +55,7 @@ from qsgm.cli.options import (
 )
 from qsgm.cli.samples import (
     TaskOption,
+    bundles_task,
     export_task,
     is_of_samples,
     learn_task,
@@ -62,6 +63,7 @@ from qsgm.cli.samples import (
     pretrain_task,
     refuse_options,
     show_learnt,
+    with_usual_layers,
 )
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError, as_text
@@ -241,8 +243,10 @@ def finetune(
     opened, name = open_bundle(bundle), as_text(paths.name_of(first))
     if is_of_samples(opened, task):
         refuse_options(center=bool(center), span=span is not None, **{"not": bool(others)})
-        usual = layers is None and blocks is None
-        learnt = learn_task(task, frames, opened, settings, usual_layers=usual)
+        own = bundles_task(opened, task)
+        if layers is None and blocks is None:
+            settings = with_usual_layers(opened, own, settings)
+        learnt = learn_task(own, frames, opened, settings)
         learnt.save(folder, name)
         _remember(folder, chosen=output is not None)
         show_learnt(learnt, folder, name, as_json)
@@ -350,16 +354,17 @@ def fidelity(
     result: Result
     if is_of_samples(opened, task):
         refuse_options(center=center is not None)
-        result = learn_task(task, [frame], opened, settings, usual_layers=layers is None)
+        own = bundles_task(opened, task)
+        settings = with_usual_layers(opened, own, settings) if layers is None else settings
+        if settings.layers == 1:
+            raise QsgmError("one layer has no SGM, so there is nothing to compare; pass --layers 2")
+        result = learn_task(own, [frame], opened, settings)
     else:
         result = _finetune([frame], [parsed_center(center)], (), opened, settings)
-    tuned = result.plan.settings.layers
-    if tuned == 1:
-        raise QsgmError("one layer has no SGM, so there is nothing to compare; pass --layers 2")
     if not result.probes:
         raise QsgmError(
-            f"the bundle {opened.folder} has no probe for {tuned} layers, so there is nothing to "
-            "compare; export it again with `qsgm fold-and-quantize`"
+            f"the bundle {opened.folder} has no probe for {settings.layers} layers, so there is "
+            "nothing to compare; export it again with `qsgm fold-and-quantize`"
         )
     report = fidelity_command_json(result, as_text(paths.name_of(frame)))
     if picture is not None:

@@ -68,20 +68,27 @@ def is_of_samples(bundle: "Bundle", file: Path | None) -> bool:
     return file is not None or bundle.manifest.task.name != GRASP
 
 
+def bundles_task(bundle: "Bundle", file: Path | None) -> "SampleTask":
+    """The task that a bundle of samples is of."""
+    from qsgm.samples.taskfile import task_of_bundle
+
+    return task_of_bundle(bundle, _device_task(file))
+
+
+def with_usual_layers(bundle: "Bundle", task: "SampleTask", settings: "Settings") -> "Settings":
+    """Settings with as many layers as the task says."""
+    from qsgm.samples.teach import usual_settings
+
+    return usual_settings(bundle, task, settings)
+
+
 def learn_task(
-    file: Path | None,
-    shown: Sequence[Path],
-    bundle: "Bundle",
-    settings: "Settings",
-    *,
-    usual_layers: bool,
+    task: "SampleTask", shown: Sequence[Path], bundle: "Bundle", settings: "Settings"
 ) -> "SamplesResult":
     """`qsgm finetune` with a bundle of samples."""
-    from qsgm.samples.taskfile import read_samples, task_of_bundle
-    from qsgm.samples.teach import learn, usual_settings
+    from qsgm.samples.taskfile import read_samples
+    from qsgm.samples.teach import learn
 
-    task = task_of_bundle(bundle, _device_task(file))
-    settings = usual_settings(bundle, task, settings) if usual_layers else settings
     samples = [read_samples(task, path) for path in shown]
     with progress() as watch:
         return learn(samples, bundle, task, settings, watch)

@@ -37,16 +37,6 @@ RefinedBy = Literal["patch", "network"]
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where an object may be."""
-
-    center_px: tuple[float, float]  # (x, y) in the frame
-    quality: float  # in [0, 1]
-    angle_deg: float  # turn since the demonstration, in (-90, 90], counter-clockwise positive
-    full_angle_deg: float | None = None  # the same in (-180, 180], where it is known
-
-
-@dataclass(frozen=True)
 class Detection:
     """The one object in a frame. When not `found`, the other fields describe the best guess."""
 
@@ -60,7 +50,8 @@ class Detection:
     refined_by: RefinedBy = "network"  # whence centre and angle are
     scale: float = 1.0  # what the frame was scaled by for the network
     margin_px: int = 0  # and mirrored beyond its border after that
-    candidates: tuple[Place, ...] = ()  # where else it may be, best first; this one is the first
+    # Where else it may be, best first; this one is the first. They have none of their own.
+    candidates: tuple["Detection", ...] = ()
 
 
 def locate(

@@ -41,7 +41,7 @@ _QUALITY_WEIGHT = 0.02
 _SAME_POSE = (20.0, np.deg2rad(25)), (10.0, np.deg2rad(17))
 # Closer than that, two candidates are the same place.
 _SAME_PX = 24.0
-# A pose that fits so well is where it belongs: its edges need not be looked for.
+# Where a pose fits so well, the object is there, and no other place is looked at closer by edges.
 _FITS_WELL = 0.8
 # What alignment by pixels has to gain over the pose that edges gave.
 _LEAST_GAIN = 0.02
@@ -166,7 +166,7 @@ def _closer(template: Template, scene: Pyramid, pose: _Pose) -> _Pose:
 
 
 def _all_aligned(appearance: Appearance, scene: Pyramid, poses: Sequence[_Pose]) -> list[_Laid]:
-    """Poses aligned by pixels, the firmest first; a few by edges, too, if none fits well."""
+    """Poses aligned by pixels; the firmest few by edges, too, if none fits well."""
     laid = []
     for pose in poses:
         way = appearance.aligner.aligned(scene, pose.fit)

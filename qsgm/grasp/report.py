@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qsgm.grasp.angles import round_degrees, rounded_angle, rounded_turn
-from qsgm.grasp.heatmap import Detection, Place
+from qsgm.grasp.heatmap import Detection
 from qsgm.grasp.taught import FinetuneResult
 from qsgm.grasp.verdict import Verdict
 from qsgm.tables import number, plain_table
@@ -55,7 +55,7 @@ def object_json(detection: Detection) -> dict[str, Any]:
     }
 
 
-def place_json(place: Place) -> dict[str, Any]:
+def place_json(place: Detection) -> dict[str, Any]:
     """A place where the object may be."""
     return {
         "center_px": [number(value, 2) for value in place.center_px],

@@ -1,7 +1,7 @@
 """One or several objects in one frame: which thing is where.
 
-Each object looks by itself. What those of one bundle share, the frozen layers, is 10 to 15 ms of
-the 85 to 100 that a look takes; the rest is the comparison with the object's own patch.
+Each object looks by itself. What those of one bundle share, the frozen layers, is the smaller part
+of a look; the rest is the comparison with the object's own patch.
 """
 
 import math
@@ -24,7 +24,7 @@ from qsgm.grasp.report import (
     predict_json,
     turn_text,
 )
-from qsgm.grasp.tuned import FOUND_FROM, TunedObject
+from qsgm.grasp.tuned import TunedObject
 from qsgm.tables import number, table
 
 # Two things as large as objects are at the scale of either have centres further apart.
@@ -99,6 +99,8 @@ def shared_out(sights: Sequence[Sight]) -> tuple[Sight, ...]:
     The surest claim comes first. Whoever loses a place takes its next candidate, and where none is
     left that is sure enough, it is not found.
     """
+    if len(sights) < 2:
+        return tuple(sights)
     claims = [
         (place, owner)
         for owner, sight in enumerate(sights)
@@ -118,26 +120,13 @@ def _left_with(sight: Sight, owner: int, kept: Sequence[tuple[Detection, int]]) 
     own = tuple(place for place, other in kept if other == owner)
     free = (one for one in _guesses(sight) if not _taken(one, owner, kept))
     best = own[0] if own else replace(next(free, sight.detection), found=False)
+    best = replace(best, candidates=sight.detection.candidates)
     return replace(sight, detection=best, instances=None if sight.instances is None else own)
 
 
 def _guesses(sight: Sight) -> list[Detection]:
     """The best place, then the other candidates."""
-    best, found = sight.detection, [sight.detection]
-    (x, y), (right, down) = best.center_px, best.displacement_px
-    for one in best.candidates[1:]:
-        place = replace(
-            best,
-            found=one.quality >= FOUND_FROM,
-            quality=one.quality,
-            center_px=one.center_px,
-            displacement_px=(one.center_px[0] - x + right, one.center_px[1] - y + down),
-            angle_deg=one.angle_deg,
-            full_angle_deg=one.full_angle_deg,
-            full_angle_confidence=None,
-        )
-        found.append(place)
-    return found
+    return [sight.detection, *sight.detection.candidates[1:]]
 
 
 def _taken(place: Detection, owner: int, kept: Sequence[tuple[Detection, int]]) -> bool:

@@ -22,7 +22,7 @@ from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
 from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
-from qsgm.grasp.heatmap import CELL_PX, Detection, Place, locate, refine
+from qsgm.grasp.heatmap import CELL_PX, Detection, locate, refine
 from qsgm.grasp.judge import JUDGED, cell_center
 from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
 from qsgm.grasp.network import CROP_PX
@@ -136,10 +136,9 @@ class TunedObject:
         """
         seen = self._seen(frame)
         heatmap = self.heatmap(seen)
-        best, *others = self._detections(seen, heatmap, JUDGED)
-        best = self._refined(best, seen)
-        places = tuple(_as_place(one) for one in (best, *others))
-        return self._in_frame(replace(best, candidates=places), frame), heatmap
+        found = self._detections(seen, heatmap, JUDGED)
+        places = tuple(self._in_frame(self._refined(one, seen), frame) for one in found)
+        return replace(places[0], candidates=places), heatmap
 
     def locate_at_any_distance(
         self, frame: NDArray[np.uint8]
@@ -149,8 +148,11 @@ class TunedObject:
         if first[0].found:
             return first
         looks = [other.locate(frame) for other in self._at_other_sizes(frame)]
-        best = max(looks, key=lambda look: look[0].quality, default=first)
-        return best if best[0].quality >= SURE_AT_OTHER_SIZES else first
+        best, heatmap = max(looks, key=lambda look: look[0].quality, default=first)
+        if best.quality < SURE_AT_OTHER_SIZES:
+            return first
+        sure = (replace(p, found=p.quality >= SURE_AT_OTHER_SIZES) for p in best.candidates)
+        return replace(best, candidates=tuple(sure)), heatmap
 
     def _at_other_sizes(self, frame: NDArray[np.uint8]) -> Iterator["TunedObject"]:
         """The same object as if it were larger or smaller, where the frame can be searched so."""
@@ -269,16 +271,12 @@ class TunedObject:
         """A place of what the network saw in the frame's own pixels."""
         height, width = frame.shape[:2]
         center = self._point_in(frame, place.center_px)
-        places = (
-            replace(one, center_px=self._point_in(frame, one.center_px)) for one in place.candidates
-        )
         return replace(
             place,
             center_px=center,
             displacement_px=(center[0] - width / 2, center[1] - height / 2),
             scale=self.description.scale,
             margin_px=self._margin_px,
-            candidates=tuple(places),
         )
 
     def _point_in(
@@ -461,10 +459,6 @@ def _moved(place: Detection, sighting: Sighting) -> Detection:
         full_angle_confidence=sighting.confidence,
         refined_by="patch",
     )
-
-
-def _as_place(found: Detection) -> Place:
-    return Place(found.center_px, found.quality, found.angle_deg, found.full_angle_deg)
 
 
 def _around(heatmap: NDArray[np.float32], cell: tuple[int, int]) -> NDArray[np.float32]:

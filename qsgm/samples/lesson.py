@@ -94,7 +94,8 @@ def ends_held_out(task: Task, shown: Sequence[Samples], overlap: int) -> SampleL
         if one.labels is None or end <= overlap:
             has = "no labels" if one.labels is None else f"{len(one)} windows"
             raise QsgmError(
-                f"a recording to learn from has {has}, expected {overlap + 2} labelled ones"
+                f"a recording to learn from has {has}, expected labelled ones, more than the last "
+                f"fifth, which is held out, and {overlap} before it; record for longer"
             )
         taught.append(Samples(one.inputs[: end - overlap], one.labels[: end - overlap]))
         held_out.append(Samples(one.inputs[end:], one.labels[end:]))

@@ -2,11 +2,9 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from toys import SIDE, lay, table, toy
+from toys import lay, plain, table, toy
 
 from qsgm.grasp.correlation import Fit, pyramid_of
 from qsgm.grasp.judge import Appearance
@@ -14,15 +12,6 @@ from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.snapping import snapped
 
 CENTER = (320.0, 240.0)
-
-
-def plain() -> NDArray[np.float32]:
-    """A spanner's outline of one colour, 90 px long: nothing on it says where it is."""
-    picture = np.zeros((SIDE, SIDE, 4), np.float32)
-    middle, steel = SIDE // 2, (200, 205, 210, 255)
-    cv2.rectangle(picture, (middle - 170, middle - 22), (middle + 170, middle + 22), steel, -1)
-    cv2.circle(picture, (middle + 150, middle), 52, steel, cv2.FILLED)
-    return picture
 
 
 PLAIN = Appearance.of(cut_patch(lay(plain(), table(), CENTER), CENTER))

@@ -18,7 +18,7 @@ from qsgm import QsgmError, load_object, tuned_folder
 from qsgm.bundle import Bundle
 from qsgm.grasp import tuned as tuned_module
 from qsgm.grasp.decision import Decision
-from qsgm.grasp.heatmap import Detection, Place, locate, refine
+from qsgm.grasp.heatmap import Detection, locate, refine
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import (
@@ -222,7 +222,7 @@ def test_candidates_are_the_judged_places_best_first_this_one_among_them(bundle:
     scene = lay(toy(), table(2), (200.0, 180.0), 20)
     found, _ = Told(bundle, described(), (200.0, 180.0), (450.0, 300.0)).locate(scene)
     first, *others = found.candidates
-    assert first == Place(found.center_px, found.quality, found.angle_deg, found.full_angle_deg)
+    assert replace(first, candidates=found.candidates) == found
     assert others
     assert [one.quality for one in found.candidates] == sorted(
         (one.quality for one in found.candidates), reverse=True
