@@ -88,6 +88,11 @@ class Look:
     agreement: Floats  # (C,), correlation of each cell by itself
 
     @property
+    def picture(self) -> NDArray[np.uint8]:
+        """What is seen, rounded: (64, 64, 3)."""
+        return np.clip(np.rint(self.seen), 0, 255).astype(np.uint8)
+
+    @property
     def score(self) -> float:
         """How well the object fits, at most 1: all of it at once, and cell by cell.
 

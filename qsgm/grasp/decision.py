@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.grasp.cells import Cells
+from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.evidence import NAMES
 
 Floats = NDArray[np.float32]
 # Of drawn scenes without the object. In photographs two to three times as many are raised.
 FALSE_ALARM_RATE = 0.01
 MOST_HIDDEN = 256
+# What the comparer says, behind all other evidence.
+COMPARED = "compared"
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,19 @@ class Decision:
     output: Floats  # (H,)
     bias: float
     threshold: float
+    comparer: Comparer | None = None  # the last piece of evidence is what it says
+
+    def judged(
+        self, cells: Cells, evidence: Floats, seen: NDArray[np.uint8]
+    ) -> NDArray[np.float64]:
+        """Qualities (N,) of candidates.
+
+        Args:
+            cells: of the taught object.
+            evidence: (N, F), as :func:`qsgm.grasp.evidence.evidence` has it.
+            seen: (N, 64, 64, 3), what lies there, moved and turned as it was taught.
+        """
+        return self.quality(with_comparison(self.comparer, cells, evidence, seen))
 
     def score(self, evidence: Floats) -> NDArray[np.float64]:
         """Log odds of evidence (..., F) coming from the object, before the threshold: (...)."""
@@ -50,7 +67,14 @@ class Decision:
             name: [float(f"{value:.9g}") for value in np.ravel(getattr(self, name))]
             for name in ("mean", "deviation", "hidden", "hidden_bias", "output")
         }
-        return {"evidence": list(NAMES), **arrays, "bias": self.bias, "threshold": self.threshold}
+        comparer = {} if self.comparer is None else {"comparer": self.comparer.to_json()}
+        return {
+            "evidence": _names(self.comparer is not None),
+            **arrays,
+            "bias": self.bias,
+            "threshold": self.threshold,
+            **comparer,
+        }
 
     @staticmethod
     def from_json(values: Mapping[str, Any], where: str) -> "Decision":
@@ -59,22 +83,26 @@ class Decision:
         Raises:
             QsgmError: it weighs other evidence, or its numbers are not what they should be.
         """
-        if not isinstance(values, Mapping) or values.get("evidence") != list(NAMES):
+        compares = isinstance(values, Mapping) and "comparer" in values
+        names = _names(compares)
+        if not isinstance(values, Mapping) or values.get("evidence") != names:
             raise QsgmError(f"{where}: the decision weighs other evidence; {_ADVICE}")
+        comparer = Comparer.from_json(values["comparer"], where) if compares else None
         try:
             with np.errstate(over="ignore"):  # infinity is refused below
                 hidden_bias = np.array(values["hidden_bias"], np.float32)
                 hidden = np.array(values["hidden"], np.float32).reshape(
-                    len(hidden_bias), len(NAMES)
+                    len(hidden_bias), len(names)
                 )
                 decision = Decision(
-                    np.array(values["mean"], np.float32).reshape(len(NAMES)),
-                    np.array(values["deviation"], np.float32).reshape(len(NAMES)),
+                    np.array(values["mean"], np.float32).reshape(len(names)),
+                    np.array(values["deviation"], np.float32).reshape(len(names)),
                     hidden,
                     hidden_bias,
                     np.array(values["output"], np.float32).reshape(len(hidden_bias)),
                     float(values["bias"]),
                     float(values["threshold"]),
+                    comparer,
                 )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise QsgmError(f"{where}: the decision's numbers do not fit; {_ADVICE}") from error
@@ -82,11 +110,25 @@ class Decision:
         return decision
 
 
+def with_comparison(
+    comparer: Comparer | None, cells: Cells, evidence: Floats, seen: NDArray[np.uint8]
+) -> Floats:
+    """Evidence (N, F), and behind it what a comparer says (N, F + 1), where there is one."""
+    if comparer is None:
+        return evidence
+    return np.column_stack([evidence, comparer.logits(cells, seen)])
+
+
+def _names(compares: bool) -> list[str]:
+    return [*NAMES, COMPARED] if compares else list(NAMES)
+
+
 _ADVICE = "make it again with this version of qsgm"
 
 
 def _check(decision: Decision, where: str) -> None:
-    numbers = [np.ravel(value) for value in vars(decision).values()]
+    fields = vars(decision).items()
+    numbers = [np.ravel(value) for name, value in fields if name != "comparer"]
     sound = all(np.isfinite(value).all() for value in numbers) and (decision.deviation > 0).all()
     if not sound or not 1 <= len(decision.output) <= MOST_HIDDEN:
         raise QsgmError(

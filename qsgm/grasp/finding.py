@@ -100,8 +100,10 @@ class Finder:
         sightings = []
         for view, appearance in zip(self.views, self.appearances, strict=True):
             found = judge(appearance, frame, heatmap, count)
-            for one in found:
-                quality = float(decision.quality(one.evidence))
+            evidence = np.stack([one.evidence for one in found])
+            seen = np.stack([one.seen for one in found])
+            judged = decision.judged(appearance.reference.cells, evidence, seen)
+            for one, quality in zip(found, judged.tolist(), strict=True):
                 sightings.append(
                     Sighting(view, one.fit, one.lead, one.center_px, quality, one.cell_px)
                 )

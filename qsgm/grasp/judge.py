@@ -77,6 +77,7 @@ class Candidate:
 
     fit: Fit
     evidence: NDArray[np.float32]  # (F,)
+    seen: NDArray[np.uint8]  # (64, 64, 3), what lies there, moved and turned as it was taught
     center_px: tuple[float, float]  # of the object, by the fit
     cell_px: tuple[float, float]  # of the window by which the network proposed it
     lead: float  # of the fit's score over that of the opposite way round
@@ -197,7 +198,8 @@ def _candidate(
     fit, look, lead = _better_way_round(appearance, scene, laid, others)
     facts = evidence(appearance.reference, look, fit.scale, pose.quality, lead)
     center = appearance.center_of(fit)
-    return Candidate(fit, facts, center, cell_center(pose.cell), lead, pose.quality)
+    cell = cell_center(pose.cell)
+    return Candidate(fit, facts, look.picture, center, cell, lead, pose.quality)
 
 
 def _better_way_round(

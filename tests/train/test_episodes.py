@@ -1,7 +1,5 @@
 """Episodes, the crops cut from their scenes, and what is made of them."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,7 @@ from losses import GraspLoss
 from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import GraspTask
-from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, best_score, fit_decision
+from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, Weighed, best_score, fit_decision
 from qsgm.train.grasp.decision_scenes import heatmap_of
 from qsgm.train.grasp.episodes import USUAL, EpisodeMaker
 from qsgm.train.model.fold import folded_start
@@ -52,11 +50,8 @@ def made_up_scenes() -> list[JudgedScene]:
         facts = rng.normal(size=(2, len(NAMES))).astype(np.float32)
         facts[0, 0] += 8.0 * (center is not None)
         places = ((100.0, 103.0), (300.0, 200.0))
-        found = tuple(
-            SimpleNamespace(evidence=fact, center_px=place)
-            for fact, place in zip(facts, places, strict=True)
-        )
-        scenes.append(JudgedScene(number // 4, center, found))  # type: ignore[arg-type]
+        found = tuple(Weighed(fact, place) for fact, place in zip(facts, places, strict=True))
+        scenes.append(JudgedScene(number // 4, center, found))
     return scenes
 
 
@@ -77,6 +72,6 @@ def test_a_heatmap_by_folded_layers_is_the_networks_own() -> None:
         raw = net(as_seen(GRASPNET, torch.from_numpy(frame[None])))
         expected = GraspLoss().activate(raw)[0].numpy()
     states = start_states(folded_start(net, 3), 1)
-    got = heatmap_of(net, states, frame, task.heads)
+    got = heatmap_of(net, states, frame, heads=task.heads)
     assert got.shape == (3, 4, 3)
     np.testing.assert_allclose(got, expected, atol=1e-5)

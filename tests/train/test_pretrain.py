@@ -15,6 +15,7 @@ from qsgm.errors import QsgmError
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import grasp_task
 from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.grasp.comparer import ComparerConfig
 from qsgm.train.grasp.decision import DecisionConfig
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig
 from qsgm.train.grasp.pretrain import DecisionStage, pretrain_grasping
@@ -59,6 +60,9 @@ TINY = PretrainConfig(
 TASK = DrawnGrasping()
 LAST = DecisionStage(
     TASK,
+    ComparerConfig(
+        episodes=2, scenes=2, channels=(4, 4, 4, 4), hidden=4, passes=1, batch=8, of_the_object=3
+    ),
     DecisionScenesConfig(episodes=2, scenes=2, crops=20, support=16, epochs=1),
     DecisionConfig(hidden=4, steps=5, folds=2),
 )

@@ -6,7 +6,7 @@ what 1 % of the scenes without the object reach.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import dist
 
 import numpy as np
@@ -15,13 +15,19 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional as F
 
+from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
-from qsgm.grasp.judge import Candidate
+from qsgm.train.grasp.comparer import OFF_OBJECT_PX, ON_OBJECT_PX
 
-# A candidate this close to the true centre is the object, one further than the other is not;
-# between the two nothing is learnt.
-ON_OBJECT_PX, OFF_OBJECT_PX = 12.0, 32.0
 Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A candidate as the decision sees it."""
+
+    evidence: Floats  # (F,)
+    center_px: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,7 @@ class JudgedScene:
 
     episode: int
     center_px: tuple[float, float] | None  # None: it is not there
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Weighed, ...]
 
 
 @dataclass(frozen=True)
@@ -44,11 +50,17 @@ class DecisionConfig:
     folds: int = 4  # the threshold is set on scenes whose episodes had no say in the weights
 
 
-def fit_decision(scenes: Sequence[JudgedScene], config: DecisionConfig, seed: int) -> Decision:
+def fit_decision(
+    scenes: Sequence[JudgedScene],
+    config: DecisionConfig,
+    seed: int,
+    comparer: Comparer | None = None,
+) -> Decision:
     """Fit weights to all scenes, and the threshold to the ones without the object.
 
-    Where the threshold lies is found by cross-validation: each fold's scenes are scored by weights
-    fitted to the other folds' episodes.
+    What the comparer says, where there is one, is the last piece of their evidence. Where the
+    threshold lies is found by cross-validation: each fold's scenes are scored by weights fitted to
+    the other folds' episodes.
     """
     empty_scores: list[float] = []
     for own, others in _folds(scenes, config.folds):
@@ -56,7 +68,7 @@ def fit_decision(scenes: Sequence[JudgedScene], config: DecisionConfig, seed: in
         empty_scores += [best_score(judge, scene) for scene in own if scene.center_px is None]
     threshold = float(np.quantile(empty_scores, 1 - FALSE_ALARM_RATE))
     whole = _fitted(scenes, config, seed)
-    return Decision(**(vars(whole) | {"threshold": threshold}))
+    return replace(whole, threshold=threshold, comparer=comparer)
 
 
 def best_score(decision: Decision, scene: JudgedScene) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -9,10 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from qsgm.grasp.comparer import Comparer
+from qsgm.grasp.decision import with_comparison
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import cut_patch
 from qsgm.task import Heads
-from qsgm.train.grasp.decision import JudgedScene
+from qsgm.train.grasp.comparer import Look
+from qsgm.train.grasp.decision import JudgedScene, Weighed
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, USUAL, Episode, EpisodeMaker
 from qsgm.train.grasp.task import DrawnGrasping, frame_lesson, shipped_things
@@ -39,6 +43,7 @@ def judged_scenes(
     net: ConvNet,
     rule: UpdateRule,
     start: Sequence[tuple[Tensor, Tensor]],
+    comparer: Comparer | None,
     config: DecisionScenesConfig,
     seed: int,
     after_episode: Callable[[], None],
@@ -49,6 +54,7 @@ def judged_scenes(
         net: in eval mode; its frozen layers are used.
         rule: by which the last layers learn.
         start: of these layers, batchnorm folded.
+        comparer: whose answers are the last piece of evidence.
         config: sizes.
         seed: of the episodes.
         after_episode: told about each.
@@ -60,7 +66,8 @@ def judged_scenes(
         episodes = [maker.draw(number, config.scenes, without=True) for number in numbers]
         taught = _teach(net, rule, start, episodes, config, seed)
         for number, episode, states in zip(numbers, episodes, taught, strict=True):
-            judged += _judge_all(number, episode, net, states, rule.task.heads)
+            look = partial(heatmap_of, net, states, heads=rule.task.heads)
+            judged += _judge_all(number, episode, look, comparer)
             after_episode()
     return judged
 
@@ -100,18 +107,19 @@ def _task(
 
 
 def _judge_all(
-    number: int,
-    episode: Episode,
-    net: ConvNet,
-    states: Sequence[LayerState],
-    heads: Heads,
+    number: int, episode: Episode, look: Look, comparer: Comparer | None
 ) -> Iterator[JudgedScene]:
     appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
+    cells = appearance.reference.cells
 
     def judged(scene: DrawnScene, center_px: tuple[float, float] | None) -> JudgedScene:
-        seen = heatmap_of(net, states, scene.image, heads)
-        found = judge(appearance, scene.image, seen)
-        return JudgedScene(number, center_px, tuple(found))
+        found = judge(appearance, scene.image, look(scene.image))
+        evidence, seen = (
+            np.stack([getattr(one, k) for one in found]) for k in ("evidence", "seen")
+        )
+        facts = with_comparison(comparer, cells, evidence, seen)
+        weighed = (Weighed(some, one.center_px) for some, one in zip(facts, found, strict=True))
+        return JudgedScene(number, center_px, tuple(weighed))
 
     for scene in episode.scenes:
         yield judged(scene, scene.center_px)
@@ -121,7 +129,7 @@ def _judge_all(
 
 @torch.no_grad()
 def heatmap_of(
-    net: ConvNet, states: Sequence[LayerState], frame: NDArray[np.uint8], heads: Heads
+    net: ConvNet, states: Sequence[LayerState], frame: NDArray[np.uint8], *, heads: Heads
 ) -> NDArray[np.float32]:
     """Quality, sine and cosine (3, rows, cols) of a frame (H, W, 3) by one task's tuned layers."""
     numbers = net.network.last(len(states))

@@ -1,21 +1,32 @@
 """`qsgm pretrain`: the grasping task from nothing to `sgm.pt`.
 
-The five stages of :mod:`qsgm.train.pretraining.pretrain`, and a sixth: how the evidence for and
-against a candidate is weighed, on whole drawn scenes.
+The five stages of :mod:`qsgm.train.pretraining.pretrain`, and a sixth, on whole drawn scenes: a
+network that compares a candidate with the taught object, and how all evidence for and against it is
+weighed.
 """
 
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.task import GraspTask
 from qsgm.progress import Progress
 from qsgm.train.checkpoint import Checkpoint
+from qsgm.train.grasp.comparer import ComparerConfig, draw_examples, train_comparer
 from qsgm.train.grasp.decision import DecisionConfig, fit_decision
-from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
+from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, heatmap_of, judged_scenes
 from qsgm.train.grasp.task import DrawnGrasping
 from qsgm.train.model.fold import folded_start
 from qsgm.train.pretraining.pretrain import Learnt, PretrainConfig, pretrain
+from qsgm.train.pretraining.tasks import start_states
+
+Start = Sequence[tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -23,23 +34,38 @@ class DecisionStage:
     """The sixth stage."""
 
     task: GraspTask
+    comparer: ComparerConfig = field(default_factory=ComparerConfig)
     scenes: DecisionScenesConfig = field(default_factory=DecisionScenesConfig)
     decision: DecisionConfig = field(default_factory=DecisionConfig)
 
     def to_json(self) -> dict[str, Any]:
-        return {"scenes": asdict(self.scenes), "decision": asdict(self.decision)}
+        return {name: asdict(getattr(self, name)) for name in ("comparer", "scenes", "decision")}
 
     def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> GraspTask:
-        done = 0
-
-        def after_episode() -> None:
-            nonlocal done
-            done += 1
-            watch("decision", done, self.scenes.episodes, {})
-
         start = folded_start(learnt.net, len(learnt.rule.rates))
-        judged = judged_scenes(learnt.net, learnt.rule, start, self.scenes, seed + 7, after_episode)
-        return replace(self.task, decision=fit_decision(judged, self.decision, seed))
+        comparer = self._comparer(learnt, start, seed + 11, watch)
+        count = _counted("decision", self.scenes.episodes, watch)
+        judged = judged_scenes(
+            learnt.net, learnt.rule, start, comparer, self.scenes, seed + 7, count
+        )
+        return replace(self.task, decision=fit_decision(judged, self.decision, seed, comparer))
+
+    def _comparer(self, learnt: Learnt, start: Start, seed: int, watch: Progress) -> Comparer:
+        states = start_states(start, 1)
+        look = partial(heatmap_of, learnt.net, states, heads=self.task.heads)
+        count = _counted("examples", self.comparer.episodes, watch)
+        examples = draw_examples(look, self.comparer, seed, count)
+
+        def after_step(done: int, steps: int) -> None:
+            watch("comparer", done, steps, {})
+
+        return train_comparer(examples, self.comparer, seed, after_step)
+
+
+def _counted(stage: str, total: int, watch: Progress) -> Callable[[], None]:
+    """Tells how many of so many are done."""
+    numbers = itertools.count(1)
+    return lambda: watch(stage, next(numbers), total, {})
 
 
 def pretrain_grasping(

@@ -1,0 +1,181 @@
+"""A small network that looks at the taught object and at what lies at a candidate, side by side.
+
+What :mod:`qsgm.grasp.evidence` lists sums a comparison up in numbers; where in the picture the two
+differ is lost in them. This one sees both pictures, moved and turned so that the object lies alike,
+and says how likely they show the same thing (a two-channel network, Zagoruyko and Komodakis 2015).
+It learnt that on drawn objects (:mod:`qsgm.train.grasp.comparer`) and learns nothing on the device:
+its answer is one more piece of evidence. 27,000 weights of 8 bits.
+"""
+
+import base64
+import binascii
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsgm.errors import QsgmError
+from qsgm.grasp.cells import SIDE, Cells
+from qsgm.grasp.correlation import NOISE_VARIANCE
+
+Floats = NDArray[np.float32]
+
+# The light of what is seen is made that of the demonstration, contrast within these bounds.
+LEAST_GAIN, MOST_GAIN = 0.4, 2.5
+LEVELS = 64.0  # that make 1
+# Taught, seen and how far apart they are, three channels each, and the mask.
+INPUTS = 10
+KERNEL = 3
+STRIDES = (2, 2, 2, 1)
+LAST_SIDE = SIDE // 8
+# How the last maps are summed up: their mean over the object, their largest, their mean.
+SUMMARIES = 3
+MOST_CHANNELS = 256
+_LARGEST_CODE = 127
+_TINY = 1e-3
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A convolution, or a product where K is not 9 times the channels in front of it."""
+
+    weight: Floats  # (K, Co); of a convolution row by row, column by column, channel by channel
+    bias: Floats  # (Co,)
+
+
+@dataclass(frozen=True)
+class Comparer:
+    """Four convolutions of 3x3 and two products behind them, ReLU between."""
+
+    convolutions: tuple[Layer, ...]
+    hidden: Layer
+    output: Layer
+
+    def logits(self, cells: Cells, seen: NDArray[np.uint8]) -> Floats:
+        """Log odds (N,) of what is seen (N, 64, 64, 3) being the object."""
+        x = side_by_side(cells, seen)
+        for layer, stride in zip(self.convolutions, STRIDES, strict=True):
+            x = np.maximum(_windows(x, stride) @ layer.weight + layer.bias, np.float32(0))
+        x = np.maximum(_summed_up(x, cells) @ self.hidden.weight + self.hidden.bias, np.float32(0))
+        return np.asarray((x @ self.output.weight + self.output.bias)[:, 0], np.float32)
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """All of them, front to back."""
+        return (*self.convolutions, self.hidden, self.output)
+
+    def to_json(self) -> dict[str, Any]:
+        """What :meth:`from_json` reads: codes of 8 bits, and a scale for each channel."""
+        codes, scales, biases = [], list[float](), list[float]()
+        for layer in self.layers:
+            scale = np.maximum(np.abs(layer.weight).max(axis=0) / _LARGEST_CODE, np.float32(1e-9))
+            codes.append(np.rint(layer.weight / scale).astype(np.int8).tobytes())
+            scales += [float(f"{value:.9g}") for value in scale]
+            biases += [float(f"{value:.9g}") for value in layer.bias]
+        return {
+            "channels": [len(layer.bias) for layer in self.layers[:-1]],
+            "codes": base64.b64encode(b"".join(codes)).decode(),
+            "scales": scales,
+            "biases": biases,
+        }
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any], where: str) -> "Comparer":
+        """Read a comparer back.
+
+        Raises:
+            QsgmError: its numbers are not what they should be.
+        """
+        try:
+            channels = [int(count) for count in values["channels"]]
+            sane = len(channels) == len(STRIDES) + 1 and 1 <= min(channels) <= max(channels)
+            if not sane or max(channels) > MOST_CHANNELS:
+                raise ValueError
+            shapes = _shapes(channels)
+            sizes = [rows * columns for rows, columns in shapes]
+            codes = base64.b64decode(values["codes"], validate=True)
+            with np.errstate(over="ignore"):  # infinity is refused below
+                all_codes = np.frombuffer(codes, np.int8).astype(np.float32)
+                wide = [columns for _, columns in shapes]
+                scales, biases = (
+                    np.split(np.array(values[name], np.float32).reshape(sum(wide)), _ends(wide))
+                    for name in ("scales", "biases")
+                )
+            weights = np.split(all_codes.reshape(sum(sizes)), _ends(sizes))
+            layers = [
+                Layer(np.asarray(weight.reshape(shape) * scale, np.float32), bias)
+                for weight, shape, scale, bias in zip(weights, shapes, scales, biases, strict=True)
+            ]
+        except (KeyError, TypeError, ValueError, OverflowError, binascii.Error) as error:
+            raise QsgmError(f"{where}: the comparer's numbers do not fit; {_ADVICE}") from error
+        if not all(np.isfinite(one.weight).all() and np.isfinite(one.bias).all() for one in layers):
+            raise QsgmError(f"{where}: the comparer's numbers are not finite; {_ADVICE}")
+        return Comparer(tuple(layers[:-2]), *layers[-2:])
+
+
+_ADVICE = "make it again with this version of qsgm"
+
+
+def side_by_side(cells: Cells, seen: NDArray[np.uint8]) -> Floats:
+    """Taught, seen in the same light, their difference and the mask: (N, 64, 64, 10)."""
+    solid = cells.solid[..., None]
+    size = np.float32(cells.solid.sum() + _TINY)
+    (taught,), here = (
+        np.asarray(some, np.float32) for some in (cells.image[None], seen)
+    )  # (64, 64, 3), (N, 64, 64, 3)
+    mean, spread = _light(taught[None], solid, size)
+    its_mean, its_spread = _light(here, solid, size)
+    gain = np.clip(np.sqrt(spread / its_spread), LEAST_GAIN, MOST_GAIN).astype(np.float32)
+    lit = (here - its_mean) * gain
+    own = np.broadcast_to(taught - mean, lit.shape)
+    mask = np.broadcast_to(2 * solid - 1, (*lit.shape[:3], 1))
+    apart = np.abs(lit - own)
+    levels = np.float32(LEVELS)
+    return np.concatenate([own / levels, lit / levels, apart / levels, mask], axis=-1)
+
+
+def _light(images: Floats, solid: Floats, size: np.float32) -> tuple[Floats, Floats]:
+    """Mean (N, 1, 1, 3) and variance (N, 1, 1, 1), all channels together, over the mask."""
+    mean = (images * solid).sum(axis=(1, 2), keepdims=True) / size
+    around = (images - mean) * solid
+    variance = (around * around).sum(axis=(1, 2, 3), keepdims=True) / size
+    return mean, np.asarray(variance + np.float32(NOISE_VARIANCE), np.float32)
+
+
+def _windows(maps: Floats, stride: int) -> Floats:
+    """Windows (N, h, w, 9 C) of maps (N, H, W, C) with a row of zeros around them."""
+    reach = KERNEL // 2
+    padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach), (0, 0)))
+    height, width = (side - KERNEL + 1 for side in padded.shape[1:3])
+    taps = [
+        padded[:, down : down + height : stride, right : right + width : stride]
+        for down in range(KERNEL)
+        for right in range(KERNEL)
+    ]
+    return np.concatenate(taps, axis=-1)
+
+
+def _summed_up(maps: Floats, cells: Cells) -> Floats:
+    """Mean over the object, largest and mean (N, 3 C) of the last maps (N, 8, 8, C)."""
+    each = SIDE // LAST_SIDE
+    coarse = cells.solid.reshape(LAST_SIDE, each, LAST_SIDE, each).mean(axis=(1, 3))
+    share = np.asarray(coarse / (coarse.sum() + np.float32(_TINY)), np.float32)
+    inside = (maps * share[..., None]).sum(axis=(1, 2))
+    return np.concatenate([inside, maps.max(axis=(1, 2)), maps.mean(axis=(1, 2))], axis=1)
+
+
+def _shapes(channels: Sequence[int]) -> list[tuple[int, int]]:
+    """Weights' shapes (K, Co) of layers with these channels, the last of which gives one."""
+    *convolved, hidden = channels
+    into = [INPUTS, *convolved[:-1]]
+    shapes = [
+        (KERNEL * KERNEL * before, after) for before, after in zip(into, convolved, strict=True)
+    ]
+    return [*shapes, (SUMMARIES * convolved[-1], hidden), (hidden, 1)]
+
+
+def _ends(sizes: Sequence[int]) -> list[int]:
+    """Where each part but the last ends."""
+    return [int(end) for end in np.cumsum(sizes)[:-1]]

@@ -1,0 +1,102 @@
+"""The comparer learns what is alike; what it learns from is the object where it says so."""
+
+import numpy as np
+import torch
+from toys import lay, table, toy
+
+from qsgm.grasp.cells import Cells
+from qsgm.grasp.correlation import Template
+from qsgm.grasp.patch import cut_patch
+from qsgm.train.grasp.comparer import (
+    Batch,
+    ComparerConfig,
+    ComparerNet,
+    Examples,
+    batch_of,
+    draw_examples,
+    train_comparer,
+    varied,
+)
+
+CENTER = (320.0, 240.0)
+CELLS = Cells.of(Template(cut_patch(lay(toy(), table(), CENTER), CENTER)))
+SMALL = ComparerConfig(
+    episodes=1, scenes=3, channels=(6, 6, 6, 6), hidden=8, passes=60, batch=16, of_the_object=8
+)
+
+
+def alike_or_not(count: int = 64) -> Examples:
+    """Stripes seen again, or stripes across."""
+    rng = np.random.default_rng(0)
+    stripes = np.where(np.arange(64) // 8 % 2, 60, 190).astype(np.uint8)
+    taught = np.broadcast_to(stripes[None, :, None, None], (1, 64, 64, 3)).copy()
+    mine = np.arange(count) % 2 == 0
+    seen = np.where(mine[:, None, None, None], taught, taught.transpose(0, 2, 1, 3))
+    noisy = np.clip(seen + rng.normal(0, 6, seen.shape), 0, 255).astype(np.uint8)
+    solid = np.full((1, 64, 64), 255, np.uint8)
+    return Examples(taught, solid, noisy, np.zeros(count, np.int64), mine)
+
+
+def test_what_is_frozen_answers_as_what_was_learnt() -> None:
+    torch.manual_seed(0)
+    net = ComparerNet((4, 5, 6, 7), 8)
+    frozen = net.frozen()
+    for one, layer in zip(net.convolutions, frozen.convolutions, strict=True):
+        weight = torch.from_numpy(layer.weight).reshape(3, 3, -1, len(layer.bias))
+        one.weight.data = weight.permute(3, 2, 0, 1).contiguous()
+    for one, layer in ((net.hidden, frozen.hidden), (net.output, frozen.output)):
+        one.weight.data = torch.from_numpy(layer.weight).T.contiguous()
+    seen = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3)).astype(np.uint8)
+    taught, views = (
+        torch.from_numpy(some).permute(0, 3, 1, 2).float()
+        for some in (np.repeat(CELLS.image[None], 3, axis=0), seen)
+    )
+    solid = torch.from_numpy(CELLS.solid)[None, None].expand(3, 1, 64, 64)
+    with torch.no_grad():
+        expected = net(taught, views, solid).numpy()
+    np.testing.assert_allclose(frozen.logits(CELLS, seen), expected, atol=1e-5)
+
+
+def test_it_learns_to_tell_what_is_alike_from_what_is_not() -> None:
+    examples, steps = alike_or_not(), list[tuple[int, int]]()
+    learnt = train_comparer(examples, SMALL, 0, lambda done, of: steps.append((done, of)))
+    assert steps[-1][0] == steps[-1][1] == SMALL.passes * len(examples) // SMALL.batch
+    cells = CELLS
+    whole = Cells(**(vars(cells) | {"image": examples.taught[0].astype(np.float32)}))
+    whole = Cells(**(vars(whole) | {"solid": np.ones((64, 64), np.float32)}))
+    logits = learnt.logits(whole, examples.seen)
+    assert (logits[examples.mine] > logits[~examples.mine].max()).mean() > 0.95
+
+
+def test_varied_examples_keep_the_object_where_its_mask_is() -> None:
+    rng, examples = np.random.default_rng(0), alike_or_not(8)
+    solid = np.zeros((1, 64, 64), np.uint8)
+    solid[:, :20, :30] = 255
+    bright = np.repeat(solid[..., None], 3, axis=3)
+    lit = Examples(bright, solid, np.repeat(bright, 8, axis=0), examples.of, examples.mine)
+    for _ in range(40):
+        batch: Batch = varied(batch_of(lit, np.arange(8)), rng)
+        inside = batch.taught[batch.solid.expand_as(batch.taught) > 0.5]
+        outside = batch.taught[batch.solid.expand_as(batch.taught) < 0.5]
+        assert {float(inside.min()), float(inside.max())} <= {0.0, 255.0}
+        assert float(inside.mean()) != float(outside.mean())
+        assert batch.seen.min() >= 0
+        assert batch.seen.max() <= 255
+
+
+def test_examples_show_the_object_where_they_say_so() -> None:
+    """A network that sees nothing proposes places anywhere; the true poses are there anyway."""
+
+    def look(frame: np.ndarray) -> np.ndarray:
+        rows, cols = ((side - 128) // 16 + 1 for side in frame.shape[:2])
+        return np.full((3, rows, cols), 0.5, np.float32)
+
+    told = list[int]()
+    examples = draw_examples(look, SMALL, 3, lambda: told.append(1))
+    assert len(told) == len(examples.taught) == 1
+    assert examples.mine.any()
+    assert not examples.mine.all()
+    taught, weight = examples.taught[0].astype(float), examples.solid[0] / 255.0
+    away = np.abs(examples.seen - taught).mean(axis=3)
+    off = (away * weight).sum(axis=(1, 2)) / weight.sum()
+    assert np.median(off[examples.mine]) < np.median(off[~examples.mine])
