@@ -6,13 +6,15 @@ compositional, Baker and Matthews 2004). Cells that disagree have little say, so
 part of the object does not pull the rest along (iteratively reweighted least squares).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import cos, exp, log, sin
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.grasp.cells import SIDE, Cells, Look, spread_out, sums_by_cell
+from qsgm.grasp.cells import ACROSS, CELL, SIDE, Cells, Look, sums_by_cell
 from qsgm.grasp.correlation import FINE, NOISE_VARIANCE, Fit, Pyramid, Template
 
 Floats = NDArray[np.float32]
@@ -22,11 +24,16 @@ _STEPS = 5
 # What a fit is off by before: right and down [px of the level], turn [rad], log of the scale.
 _EXPECTED_ERROR = np.array([1.0, 1.0, 0.05, 0.05])
 # Further from where it began, a fit has slid onto something else.
-_FURTHEST = np.array([4.0, 4.0, 0.2, 0.15])
+_FURTHEST = 4.0, 4.0, 0.2, 0.15
 # A step smaller than that is not worth another look.
-_NOTHING = np.array([0.03, 0.03, 0.001, 0.001])
+_NOTHING = 0.03, 0.03, 0.001, 0.001
+# A step's logarithm of the scale beyond that is of nothing that can be found.
+_MOST_GROWTH = 10.0
 # Of the taught contrast, so much has to be there.
 _LEAST_GAIN = 0.2
+
+# From a number of each channel to a row of the image.
+_IN_A_ROW = np.tile(np.eye(3, dtype=np.float32), SIDE)
 
 
 @dataclass(frozen=True)
@@ -34,9 +41,9 @@ class Aligner:
     """A patch's cells and slopes at half of the resolution; D numbers, all channels together."""
 
     cells: Cells
-    slopes: Floats  # (4, D) by right, down, turn and log of the scale
-    slope_means: Floats  # (C, 3, 4), of each cell
-    slope_products: Floats  # (C, 4, 4)
+    slopes: Floats  # (4, D) by right, down, turn and log of the scale, times the mask
+    slope_means: Floats  # (C, 3 * 4), of each cell
+    slope_products: Floats  # (C, 4 * 4)
     prior: Doubles  # (4, 4), keeps a step small where nothing says how far to go
     middle_px: tuple[float, float]  # of the mask (x, y) [px of the frame] from the patch's middle
 
@@ -55,12 +62,11 @@ class Aligner:
         prior = np.diag(NOISE_VARIANCE / (max(total, 1.0) * _EXPECTED_ERROR**2))
         along = (cells.solid * x[..., 0]).sum(), (cells.solid * y[..., 0]).sum()
         across, below = ((1 << FINE) * float(one) / max(total, 1e-6) for one in along)
-        by_kind = np.ascontiguousarray(each.reshape(-1, 4).T)
         return Aligner(
             cells,
-            by_kind,
-            _means(inside, cells).reshape(-1, 3, 4),
-            _means(products, cells).reshape(-1, 4, 4),
+            np.ascontiguousarray(inside.reshape(-1, 4).T),
+            _means(inside, cells),
+            _means(products, cells),
             prior,
             (across, below),
         )
@@ -76,46 +82,43 @@ class Aligner:
         for _ in range(_STEPS):
             step = self._step(look)
             here = stepped(here, step)
-            if (_distances(here, fit) > _FURTHEST).any():
+            if _any_beyond(_distances(here, fit), _FURTHEST):
                 break
             look = self.look(scene, here)
             if look.score > best[0].score:
                 best = replace(here, score=look.score), look
-            if (np.abs(step) < _NOTHING).all():
+            if not _any_beyond(step.tolist(), _NOTHING):
                 break
         return best
 
     def _step(self, look: Look) -> Doubles:
         """By how much (4,) the patch seems to be off."""
-        trust = look.trust()
-        whole = look.whole(trust)
+        trust, whole = look.trust, look.trusted
         if whole.gain < _LEAST_GAIN:
             return np.zeros(4)
-        means = np.tensordot(trust, self.slope_means, 1)  # (3, 4)
-        normal = np.tensordot(trust, self.slope_products, 1) - means.T @ means + self.prior
-        cells = self.cells
+        means = (trust @ self.slope_means).reshape(3, 4)
+        normal = (trust @ self.slope_products).reshape(4, 4) - means.T @ means + self.prior
         light = np.float32(1 / whole.gain)
-        level = (whole.taught_mean - whole.mean * light).astype(np.float32)
-        # Flat, and not broadcast over three channels, which numpy does in steps of three numbers.
-        left = look.seen.ravel() * light - cells.image.ravel()
-        left += np.tile(level, SIDE * SIDE)
-        left *= self._pixel_trust(trust)
-        return np.asarray(np.linalg.solve(normal, (self.slopes @ left).astype(np.float64)))
-
-    def _pixel_trust(self, trust: Floats) -> Floats:
-        """What each number of the difference counts (D,)."""
-        weight = spread_out(trust / self.cells.size) * self.cells.solid
-        return np.repeat(weight.ravel(), 3)
+        level = whole.taught_mean - whole.mean * light
+        # In rows of the image, and not broadcast over three channels, which numpy does in steps of
+        # three numbers.
+        left = look.seen.reshape(SIDE, -1) * light
+        left -= self.cells.image.reshape(SIDE, -1)
+        left += level @ _IN_A_ROW
+        by_cell = (trust / self.cells.size).reshape(ACROSS, 1, ACROSS)
+        in_cells = left.reshape(ACROSS, CELL, -1)
+        in_cells *= np.repeat(by_cell, 3 * CELL, axis=2)
+        return np.asarray(np.linalg.solve(normal, (self.slopes @ left.ravel()).astype(np.float64)))
 
 
 def as_taught(scene: Pyramid, fit: Fit) -> Floats:
     """The scene (64, 64, 3) moved so that the fitted object lies as in the demonstration."""
     level = scene.level(FINE)
-    step = 1 << FINE
-    cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
-    turn = np.array([[cos, sin], [-sin, cos]])  # from the upright window to the scene
-    center = (np.array(fit.center_px) + 0.5) / step - 0.5
-    motion = np.concatenate([turn, (center - turn @ np.full(2, (SIDE - 1) / 2))[:, None]], axis=1)
+    c, s = fit.scale * cos(fit.turn_rad), fit.scale * sin(fit.turn_rad)
+    x, y = ((value + 0.5) / (1 << FINE) - 0.5 for value in fit.center_px)
+    middle = (SIDE - 1) / 2
+    # From the upright window to the scene.
+    motion = np.array([[c, s, x - (c + s) * middle], [-s, c, y - (c - s) * middle]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     seen = cv2.warpAffine(level, motion, (SIDE, SIDE), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(seen, dtype=np.float32)
@@ -137,23 +140,22 @@ def _means(image: Floats, cells: Cells) -> Floats:
 
 def stepped(fit: Fit, step: Doubles) -> Fit:
     """The fit from which the patch is off by nothing, if it was off by `step` (4,)."""
-    right, down, turn, growth = step
-    angle, scale = fit.turn_rad - float(turn), fit.scale * float(np.exp(-growth))
-    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    right, down, turn, growth = step.tolist()
+    growth = min(max(growth, -_MOST_GROWTH), _MOST_GROWTH)
+    angle, scale = fit.turn_rad - turn, fit.scale * exp(-growth)
+    c, s = scale * cos(angle), scale * sin(angle)
     (x, y), halved = fit.center_px, 1 << FINE
-    x -= halved * float(cos * right + sin * down)
-    y -= halved * float(cos * down - sin * right)
-    return Fit(fit.score, angle, scale, (x, y))
+    center = x - halved * (c * right + s * down), y - halved * (c * down - s * right)
+    return Fit(fit.score, angle, scale, center)
 
 
-def _distances(one: Fit, other: Fit) -> Doubles:
+def _distances(one: Fit, other: Fit) -> tuple[float, ...]:
     """How far apart two fits are: right, down [px of the level], turn and log of the scale."""
     (x, y), (other_x, other_y) = one.center_px, other.center_px
     halved = 1 << FINE
-    values = (
-        (x - other_x) / halved,
-        (y - other_y) / halved,
-        one.turn_rad - other.turn_rad,
-        np.log(one.scale / other.scale),
-    )
-    return np.abs(values)
+    turn, growth = one.turn_rad - other.turn_rad, log(one.scale / other.scale)
+    return (x - other_x) / halved, (y - other_y) / halved, turn, growth
+
+
+def _any_beyond(values: Sequence[float], bounds: Sequence[float]) -> bool:
+    return any(abs(value) > bound for value, bound in zip(values, bounds, strict=True))

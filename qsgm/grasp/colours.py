@@ -25,15 +25,15 @@ class Colours:
     @staticmethod
     def of(pixels: Floats) -> "Colours":
         """Colours of pixels (N, 3) BGR, at least one."""
-        logs = np.log(pixels + np.float32(DARK))
-        ratios = np.stack([logs[:, 2] - logs[:, 1], logs[:, 0] - logs[:, 1]], axis=1)
+        planes = np.ascontiguousarray(pixels.T)
+        blue, green, red = np.log(planes + np.float32(DARK))
+        ratios = np.stack([red - green, blue - green])
         bins = ((ratios + _LARGEST) * (_BINS / (2 * _LARGEST))).astype(np.int64)
-        rows, columns = np.clip(bins, 0, _BINS - 1).T
+        rows, columns = np.clip(bins, 0, _BINS - 1)
         counts = np.bincount(rows * _BINS + columns, minlength=_BINS * _BINS)
         smooth = cv2.GaussianBlur(counts.reshape(_BINS, _BINS).astype(np.float32), (3, 3), 0)
-        middle = np.median(ratios, axis=0).astype(np.float32)
-        mean = np.log(pixels.mean(axis=0) + np.float32(DARK)).astype(np.float32)
-        return Colours(middle, np.asarray(smooth / smooth.sum(), dtype=np.float32), mean)
+        mean = np.log(planes.mean(axis=1) + np.float32(DARK)).astype(np.float32)
+        return Colours(medians(ratios), np.asarray(smooth / smooth.sum(), dtype=np.float32), mean)
 
     def shift(self, other: "Colours") -> float:
         """How far the median hue is from another's."""
@@ -47,3 +47,11 @@ class Colours:
         """The largest difference of a channel's gain from the three gains' mean."""
         gains = self.mean - other.mean
         return float(np.abs(gains - gains.mean()).max())
+
+
+def medians(rows: Floats) -> Floats:
+    """Medians (M,) of rows of numbers (M, N), none of them NaN."""
+    upper = rows.shape[1] // 2
+    lower = (rows.shape[1] - 1) // 2
+    ordered = np.partition(rows, sorted({lower, upper}), axis=1)
+    return np.asarray((ordered[:, lower] + ordered[:, upper]) / 2, dtype=np.float32)

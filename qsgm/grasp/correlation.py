@@ -8,14 +8,13 @@ every place within 16 px of a candidate; the best few go on to a quarter of it. 
 level are a few matrix products.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import cos, radians, sin
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from qsgm.grasp.patch import PATCH_PX, Patch, mirrored_square
@@ -25,7 +24,7 @@ Floats = NDArray[np.float32]
 WINDOW_PX = 128
 # Halvings of the resolution, coarse to fine.
 COARSE, MIDDLE, FINE = 3, 2, 1
-_STRIP_ROWS = 64  # halved at once
+_STRIP_ROWS = 32  # halved at once
 SCALES = (0.85, 1.0, 1.18)
 # Variance [levels²] that a flat surface's noise has anyway: without it noise correlates with noise.
 NOISE_VARIANCE = 30.0
@@ -33,6 +32,7 @@ NOISE_VARIANCE = 30.0
 _COARSE_POSES = tuple(
     (float(turn), scale) for scale in SCALES for turn in np.deg2rad(np.arange(0, 360, 15))
 )
+_ALL_COARSE = frozenset(_COARSE_POSES)
 _COARSE_REACH = 2  # px of the level
 _MIDDLE_TURNS = (-radians(6), 0.0, radians(6))
 _MIDDLE_SCALES, _MIDDLE_REACH = (0.93, 1.0, 1.07), 2
@@ -43,7 +43,12 @@ _STARTS = 3
 _PARTS = 4
 # What their own agreement counts; the rest is that of the whole.
 _PARTS_COUNT = np.float32(2 / 3)
+_ALL_PARTS = np.arange(_PARTS**2)
 _TINY = 1e-9
+
+
+# Turn [rad], scale.
+Pose = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -76,53 +81,67 @@ def pyramid_of(frame: NDArray[np.uint8]) -> Pyramid:
 
 
 def _halved(image: NDArray[np.uint8] | Floats) -> Floats:
-    """Half of an image, strip by strip: the whole of it as floats is four times as large."""
+    """Half of an image, strip by strip: the whole of it as floats is four times as large.
+
+    A fourth channel, of nothing, makes it four times as quick: with three OpenCV goes number by
+    number. All sums are exact.
+    """
     height, width = (max(side // 2, 1) for side in image.shape[:2])
     even = image[: 2 * height, : 2 * width]  # else a pixel would be of a little more
     halved = np.empty((height, width, 3), np.float32)
+    rows, half = (np.empty((k * _STRIP_ROWS, k * width, 4), np.float32) for k in (2, 1))
     for top in range(0, height, _STRIP_ROWS):
         strip = halved[top : top + _STRIP_ROWS]
-        rows = even[2 * top : 2 * (top + len(strip))].astype(np.float32)
-        cv2.resize(rows, (width, len(strip)), strip, interpolation=cv2.INTER_AREA)
+        count = len(strip)
+        rows[: 2 * count] = cv2.cvtColor(even[2 * top : 2 * (top + count)], cv2.COLOR_BGR2BGRA)
+        size = (width, count)
+        cv2.resize(rows[: 2 * count], size, half[:count], interpolation=cv2.INTER_AREA)
+        cv2.cvtColor(half[:count], cv2.COLOR_BGRA2BGR, strip)
     return halved
 
 
 @dataclass(frozen=True)
-class Parts:
-    """K turned and scaled patches cut into P parts of E pixels, as columns of matrices."""
+class Trials:
+    """K turned and scaled patches at one level, each cut into P parts of E pixels.
 
-    centred: Floats  # (P, 3 E, K): pixel minus the part's mean, times its mask
+    Parts that show nothing of the object in any of them are left out.
+    """
+
+    live: NDArray[np.intp]  # (P,), which of the window's parts these are
+    coloured: Floats  # (P, 3 E, K): the pixel times its mask
     mask: Floats  # (P, E, K), sums to 1 in each part
     share: Floats  # (P, K), of the object's pixels, sums to 1
+    mean: Floats  # (P, 3, K)
     variance: Floats  # (P, K)
+    whole_mean: Floats  # (3, K)
+    whole_variance: Floats  # (K,)
 
     @staticmethod
-    def of(colour: Floats, mask: Floats) -> "Parts":
-        """Cut patches (K, 3, D) with masks (K, D) that sum to 1."""
-        pixels, covered = _in_parts(colour), _in_parts(mask[:, None])[:, :, 0]
-        share = covered.sum(axis=2)
-        weight = covered / np.maximum(share, _TINY)[..., None]
-        pixels = pixels - np.einsum("pkce,pke->pkc", pixels, weight)[..., None]
-        centred = pixels * weight[:, :, None]
-        variance = np.einsum("pkce,pkce->pk", centred, pixels)
-        columns = centred.reshape(*share.shape, -1).transpose(0, 2, 1)
-        return Parts(
-            np.ascontiguousarray(columns),
-            np.ascontiguousarray(weight.transpose(0, 2, 1)),
+    def of(patches: Floats) -> "Trials":
+        """From patches (16, K, 4, E), image and mask, as :func:`in_parts` cuts them."""
+        covered = patches[:, :, 3].sum(axis=2)
+        live = np.flatnonzero(covered.any(axis=1))
+        if not len(live):
+            live = _ALL_PARTS
+        patches, covered = patches[live], covered[live]
+        colour, mask = patches[:, :, :3], patches[:, :, 3]
+        share = covered / np.maximum(covered.sum(axis=0), _TINY)
+        weight = mask / np.maximum(covered, _TINY)[..., None]
+        weighed = colour * weight[:, :, None]
+        mean = np.ascontiguousarray(weighed.sum(axis=3).transpose(0, 2, 1))
+        square = np.einsum("pkce,pkce->pk", weighed, colour)
+        whole_mean = np.einsum("pck,pk->ck", mean, share)
+        whole_square = np.einsum("pk,pk->k", square, share)
+        return Trials(
+            live,
+            weighed.reshape(*share.shape, -1).transpose(0, 2, 1),
+            weight.transpose(0, 2, 1),
             share,
-            variance,
+            mean,
+            np.maximum(square - (mean * mean).sum(axis=1), 0),
+            whole_mean,
+            np.maximum(whole_square - (whole_mean * whole_mean).sum(axis=0), 0),
         )
-
-
-@dataclass(frozen=True)
-class Trials:
-    """K turned and scaled patches at one level, as rows of matrices."""
-
-    centred: Floats  # (K, 3 D): pixel minus mean, times the mask
-    mask: Floats  # (K, D), sums to 1
-    variance: Floats  # (K,)
-    mean: Floats  # (K, 3)
-    parts: Parts
 
 
 @dataclass(frozen=True)
@@ -131,17 +150,34 @@ class Template:
 
     patch: Patch
     _coarse: list[Trials] = field(default_factory=list)
+    _middle: dict[Pose, Trials] = field(default_factory=dict)
     _layers: dict[int, Floats] = field(default_factory=dict)
 
-    def trials(self, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
-        """The patch in every pose (turn [rad], scale), side by side."""
-        return _trials_of(self.layer(level), level, poses)
+    def trials(self, level: int, poses: Sequence[Pose]) -> Trials:
+        """The patch in every pose, side by side."""
+        side, layer = WINDOW_PX >> level, self.layer(level)
+        turned = np.empty((len(poses), side, side, 4), np.float32)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        for window, pose in zip(turned, poses, strict=True):
+            motion = _motion(len(layer), side, *pose)
+            border = cv2.BORDER_REPLICATE
+            cv2.warpAffine(layer, motion, (side, side), window, flags=flags, borderMode=border)
+        return Trials.of(in_parts(turned))
 
     def coarse_trials(self) -> Trials:
         """The patch in all coarse poses."""
         if not self._coarse:
             self._coarse.append(self.trials(COARSE, _COARSE_POSES))
         return self._coarse[0]
+
+    def middle_trials(self, around: Pose) -> tuple[Trials, list[Pose]]:
+        """The patch in poses around one, kept if that is a coarse one, and those poses."""
+        turn, scale = around
+        poses = [(turn + more, scale * s) for s in _MIDDLE_SCALES for more in _MIDDLE_TURNS]
+        trials = self._middle.get(around) or self.trials(MIDDLE, poses)
+        if around in _ALL_COARSE:
+            self._middle[around] = trials
+        return trials, poses
 
     def layer(self, level: int) -> Floats:
         """Image and mask, (side, side, 4), at a level."""
@@ -167,159 +203,146 @@ def coarse_fits(
         Up to three for each point, best first, their turns at least 25 degrees apart.
     """
     trials = template.coarse_trials()
-    around = [windows_around(scene, COARSE, center, _COARSE_REACH) for center in centers_px]
-    scores = agreement(np.concatenate([windows for windows, _ in around]), trials)
-    of_each = scores.reshape(len(around), -1, len(_COARSE_POSES))
-    return [
-        _distinct(some, places, _COARSE_POSES)
-        for some, (_, places) in zip(of_each, around, strict=True)
-    ]
+    starts = []
+    for center in centers_px:
+        windows, places = windows_around(scene, COARSE, center, _COARSE_REACH, trials.live)
+        starts.append(_distinct(agreement(windows, trials), places, _COARSE_POSES))
+    return starts
 
 
 def middle_fit(template: Template, scene: Pyramid, start: Fit) -> Fit:
     """A coarse fit at a quarter of the resolution."""
-    return _refined(template, scene, MIDDLE, start, _MIDDLE_TURNS, _MIDDLE_SCALES, _MIDDLE_REACH)
+    trials, poses = template.middle_trials((start.turn_rad, start.scale))
+    windows, places = windows_around(scene, MIDDLE, start.center_px, _MIDDLE_REACH, trials.live)
+    return _best(agreement(windows, trials), places, poses)
 
 
-def _refined(
-    template: Template,
-    scene: Pyramid,
-    level: int,
-    start: Fit,
-    turns: Sequence[float],
-    scales: Sequence[float],
-    reach: int,
-) -> Fit:
-    poses = [(start.turn_rad + turn, start.scale * scale) for scale in scales for turn in turns]
-    scores, places = _scores(template, scene, level, poses, start.center_px, reach)
-    place, pose = np.unravel_index(int(scores.argmax()), scores.shape)
-    x, y = places[place]
-    return Fit(float(scores[place, pose]), *poses[pose], (float(x), float(y)))
+def _best(scores: Floats, places: Floats, poses: Sequence[Pose]) -> Fit:
+    """The best of K poses at A places, by their scores (A, K)."""
+    place, pose = divmod(int(scores.argmax()), len(poses))
+    x, y = places[place].tolist()
+    return Fit(float(scores[place, pose]), *poses[pose], (x, y))
 
 
-def _distinct(scores: Floats, places: Floats, poses: Sequence[tuple[float, float]]) -> list[Fit]:
+def _distinct(scores: Floats, places: Floats, poses: Sequence[Pose]) -> list[Fit]:
     """The best trials whose turns differ, as starts for the next level."""
     best = scores.max(axis=0)
     starts: list[Fit] = []
-    for pose in np.argsort(-best, kind="stable"):
+    for pose in np.argsort(-best, kind="stable").tolist():
         turn, scale = poses[pose]
         if all(abs(_wrapped(turn - start.turn_rad)) > _SAME_TURN for start in starts):
-            place = places[int(scores[:, pose].argmax())]
-            starts.append(Fit(float(best[pose]), turn, scale, (float(place[0]), float(place[1]))))
+            x, y = places[int(scores[:, pose].argmax())].tolist()
+            starts.append(Fit(float(best[pose]), turn, scale, (x, y)))
         if len(starts) == _STARTS:
             break
     return starts
 
 
-def _scores(
-    template: Template,
-    scene: Pyramid,
-    level: int,
-    poses: Sequence[tuple[float, float]],
-    center_px: tuple[float, float],
-    reach: int,
-) -> tuple[Floats, Floats]:
-    """Agreement (A, K) of K poses at A places, and the places (A, 2) [px of the frame]."""
-    trials = template.trials(level, poses)
-    windows, places = windows_around(scene, level, center_px, reach)
-    return agreement(windows, trials), places
+@dataclass(frozen=True)
+class _Compared:
+    """A windows under each of K masks, part by part: means of what is seen there."""
+
+    mean: Floats  # (P, A, 3, K), of each channel
+    square: Floats  # (P, A, K), of all channels' squares together
+    product: Floats  # (P, A, K), of what is seen times the patch
+
+    @staticmethod
+    def of(windows: Floats, trials: Trials) -> "_Compared":
+        """Compare windows (P, A, 3, E)."""
+        parts, count, channels, pixels = windows.shape
+        mean = windows.reshape(parts, -1, pixels) @ trials.mask
+        square = np.einsum("pace,pace->pae", windows, windows) @ trials.mask
+        product = windows.reshape(parts, count, -1) @ trials.coloured
+        return _Compared(mean.reshape(parts, count, channels, -1), square, product)
+
+    def whole(self, trials: Trials) -> Floats:
+        """Correlation of all parts as one image (A, K)."""
+        mean = np.einsum("pack,pk->ack", self.mean, trials.share)
+        square = np.einsum("pak,pk->ak", self.square, trials.share)
+        product = np.einsum("pak,pk->ak", self.product, trials.share)
+        variance = np.maximum(square - np.einsum("ack,ack->ak", mean, mean), 0)
+        product -= np.einsum("ack,ck->ak", mean, trials.whole_mean)
+        noisy = (variance + NOISE_VARIANCE) * (trials.whole_variance + NOISE_VARIANCE)
+        return np.asarray(product / np.sqrt(noisy), dtype=np.float32)
+
+    def by_parts(self, trials: Trials) -> Floats:
+        """What the parts' own correlations come to (A, K), each as it covers the object."""
+        noisy = self.square - np.einsum("pack,pack->pak", self.mean, self.mean)
+        np.maximum(noisy, 0, out=noisy)
+        noisy += NOISE_VARIANCE
+        noisy *= (trials.variance + NOISE_VARIANCE)[:, None]
+        scores = self.product - np.einsum("pack,pck->pak", self.mean, trials.mean)
+        scores /= np.sqrt(noisy, out=noisy)
+        np.maximum(scores, 0, out=scores)
+        return np.asarray(np.einsum("pak,pk->ak", scores, trials.share), dtype=np.float32)
 
 
 def agreement(windows: Floats, trials: Trials) -> Floats:
-    """How well windows (A, 3, D) fit K trials, at most 1: all at once, and part by part (A, K).
+    """How well windows (P, A, 3, E) fit K trials, at most 1: at once, and part by part (A, K).
 
     A part that disagrees counts nothing, however much it disagrees.
     """
-    whole, _, _ = correlate(windows, trials)
-    apart = _by_parts(windows, trials.parts)
-    return np.asarray(whole + _PARTS_COUNT * (apart - whole), dtype=np.float32)
+    compared = _Compared.of(windows, trials)
+    whole = compared.whole(trials)
+    return whole + _PARTS_COUNT * (compared.by_parts(trials) - whole)
 
 
-def _by_parts(windows: Floats, parts: Parts) -> Floats:
-    """What the parts' own correlations come to (A, K), each counting as it covers the object."""
-    seen = _in_parts(windows)
-    count, places, channels, pixels = seen.shape
-    mean = (seen.reshape(count, -1, pixels) @ parts.mask).reshape(count, places, channels, -1)
-    variance = np.einsum("pace,pace->pae", seen, seen) @ parts.mask
-    variance -= np.einsum("pack,pack->pak", mean, mean)
-    noisy = np.maximum(variance, 0, out=variance)
-    noisy += NOISE_VARIANCE
-    noisy *= (parts.variance + NOISE_VARIANCE)[:, None]
-    product = seen.reshape(count, places, -1) @ parts.centred
-    product /= np.sqrt(noisy, out=noisy)
-    np.maximum(product, 0, out=product)
-    return np.asarray(np.einsum("pak,pk->ak", product, parts.share), dtype=np.float32)
+def correlate(windows: Floats, trials: Trials) -> Floats:
+    """Masked colour correlation (A, K) of windows (P, A, 3, E) with K trials."""
+    return _Compared.of(windows, trials).whole(trials)
 
 
-def _in_parts(images: Floats) -> Floats:
-    """Square images (N, M, D) cut into parts (P, N, M, E)."""
-    count, planes, pixels = images.shape
-    cell = math.isqrt(pixels) // _PARTS
-    cut = images.reshape(count, planes, _PARTS, cell, _PARTS, cell).transpose(2, 4, 0, 1, 3, 5)
+def in_parts(images: Floats) -> Floats:
+    """Square images (N, side, side, M) cut into parts (P, N, M, E)."""
+    count, side, _, planes = images.shape
+    cell = side // _PARTS
+    cut = images.reshape(count, _PARTS, cell, _PARTS, cell, planes).transpose(1, 3, 0, 5, 2, 4)
     return np.ascontiguousarray(cut).reshape(_PARTS**2, count, planes, cell * cell)
 
 
-def correlate(windows: Floats, trials: Trials) -> tuple[Floats, Floats, Floats]:
-    """Masked colour correlation of windows (A, 3, D) with K trials.
+def windows_around(
+    scene: Pyramid,
+    level: int,
+    center_px: tuple[float, float],
+    reach: int,
+    live: NDArray[np.intp] = _ALL_PARTS,
+) -> tuple[Floats, Floats]:
+    """All windows of a level within `reach` pixels of a point.
+
+    Args:
+        scene: the frame.
+        level: how often it is halved.
+        center_px: the point.
+        reach: right and down together.
+        live: which P parts of each window are wanted.
 
     Returns:
-        Correlation (A, K); the windows' means under each mask (A, 3, K) and variances (A, K).
-    """
-    count, channels, pixels = windows.shape
-    mean = (windows.reshape(-1, pixels) @ trials.mask.T).reshape(count, channels, -1)
-    square = np.einsum("acd,acd->ad", windows, windows) @ trials.mask.T
-    variance = np.maximum(square - np.einsum("ack,ack->ak", mean, mean), 0.0)
-    product = windows.reshape(count, -1) @ trials.centred.T
-    size = (variance + NOISE_VARIANCE) * (trials.variance + NOISE_VARIANCE)
-    return product / np.sqrt(size), mean, variance
-
-
-def windows_around(
-    scene: Pyramid, level: int, center_px: tuple[float, float], reach: int
-) -> tuple[Floats, Floats]:
-    """All windows (A, 3, D) of a level within `reach` pixels of a point, and their centres (A, 2).
-
-    A centre is in pixels of the frame; beyond the border the frame is mirrored.
+        Windows (P, A, 3, E), cut as :func:`in_parts` does, and their centres (A, 2) [px of the
+        frame]; beyond its border the frame is mirrored.
     """
     side, step = WINDOW_PX >> level, 1 << level
-    image = scene.level(level)
+    wide, cell = side + 2 * reach, side // _PARTS
     left, top = (round((value + 0.5) / step - side / 2) - reach for value in center_px)
-    region = mirrored_square(image, left, top, side + 2 * reach)
-    channels = np.ascontiguousarray(region.transpose(2, 0, 1))
-    views = sliding_window_view(channels, (side, side), (1, 2))  # (3, rows, columns, side, side)
-    down, right = _diamond(reach)
-    windows = np.ascontiguousarray(views[:, down, right].swapaxes(0, 1))
-    corner = np.stack([left + right, top + down], axis=1)
-    places = (step * (corner + side / 2) - 0.5).astype(np.float32)
-    return windows.reshape(len(places), 3, side * side), places
+    square = mirrored_square(scene.level(level), left, top, wide)
+    planes = np.ascontiguousarray(square.transpose(2, 0, 1))
+    # A look at every part of every window of the square; those that are wanted are copied.
+    plane, row, column = planes.strides
+    steps = wide - side + 1
+    shape = (_PARTS, _PARTS, steps, steps, 3, cell, cell)
+    strides = (cell * row, cell * column, row, column, plane, row, column)
+    down, right, offsets = _diamond(reach)
+    rows, columns = np.divmod(live[:, None], _PARTS)
+    parts = np.ndarray(shape, np.float32, planes, strides=strides)[rows, columns, down, right]
+    first = np.array([step * (at + side / 2) - 0.5 for at in (left, top)], np.float32)
+    return parts.reshape(len(live), len(down), 3, cell * cell), first + step * offsets
 
 
-def _diamond(reach: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of what is at most `reach` steps from the middle of a square."""
+@cache
+def _diamond(reach: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    """What is at most `reach` steps from the middle of a square: rows, columns, both (A, 2)."""
     at = np.abs(np.arange(-reach, reach + 1))
     down, right = np.nonzero(at[:, None] + at <= reach)
-    return down, right
-
-
-def _trials_of(layer: Floats, level: int, poses: Sequence[tuple[float, float]]) -> Trials:
-    """A patch (side, side, 4), image and mask, in K poses."""
-    side = WINDOW_PX >> level
-    turned = np.empty((len(poses), side, side, 4), np.float32)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for window, pose in zip(turned, poses, strict=True):
-        motion = _motion(len(layer), side, *pose)
-        cv2.warpAffine(
-            layer, motion, (side, side), window, flags=flags, borderMode=cv2.BORDER_REPLICATE
-        )
-    planes = np.ascontiguousarray(turned.reshape(len(poses), -1, 4).transpose(0, 2, 1))
-    colour, mask = planes[:, :3], planes[:, 3]
-    mask /= np.maximum(mask.sum(axis=1, keepdims=True), 1e-6)
-    parts = Parts.of(colour, mask)
-    mean = np.einsum("kcd,kd->kc", colour, mask)
-    colour -= mean[..., None]
-    centred = colour * mask[:, None]
-    variance = np.einsum("kcd,kcd->k", centred, colour)
-    return Trials(centred.reshape(len(poses), -1), mask, variance, mean, parts)
+    return down, right, np.stack([right, down], axis=1).astype(np.float32)
 
 
 def _motion(patch_px: int, side: int, turn: float, scale: float) -> NDArray[np.float64]:

@@ -7,7 +7,10 @@ another table, in other light, partly hidden: :data:`NAMES` lists those that tog
 the fit are told apart worse without it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from math import log, sqrt
 
 import cv2
 import numpy as np
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 
 from qsgm.grasp.alignment import slopes
 from qsgm.grasp.cells import Cells, Look
-from qsgm.grasp.colours import Colours
+from qsgm.grasp.colours import Colours, medians
 from qsgm.grasp.correlation import NOISE_VARIANCE
 from qsgm.grasp.outline import Outline, contrasts, likeness
 
@@ -45,7 +48,10 @@ NAMES = (
     "quality_logit",  # what the tuned network says
     "lead",  # over the other way round
 )
-_GRADIENT_NOISE = 4.0  # levels
+_GRADIENT_NOISE = np.float32(4.0)  # levels
+_GREY = np.full(3, 1 / 3, np.float32)
+_TINY = 1e-4
+_EDGES_AT = np.array([0.1, 0.25, 0.5])
 # Of squares that the mask grows by: for its rim, out to the ring around it, and in to that ring.
 _RIM_PX, _OUTER_PX, _INNER_PX = 5, 13, 3
 _LARGEST_LOGIT = 8.0
@@ -63,35 +69,80 @@ class Reference:
     cells: Cells
     rim: Floats  # (64, 64), the mask with its surroundings, sums to 1
     ring: Floats  # (64, 64), around the object, sums to 1
-    normal: Floats  # (64, 64, 2), the outline's normal times its strength, which sums to 1
-    gradient: Floats  # (64, 64, 2)
+    normal: Floats  # (2, 4096), the outline's normal times its strength, which sums to 1
+    gradient: Floats  # (2, 4096), see :func:`_directions`
     inside: NDArray[np.bool_]  # (64, 64), never empty
     outline: Outline
     rim_colours: Floats  # (N, 3), just inside the outline
     colours: Colours
+    mean: Floats  # (3,) of the object
+    variance: float  # of it, all channels together, noise included
+
+    @cached_property
+    def _places(self) -> NDArray[np.intp]:
+        """Of the pixels inside, in reading order."""
+        return np.flatnonzero(self.inside)
+
+    def pixels(self, image: Floats) -> Floats:
+        """Colours (3, M) of an image's pixels inside."""
+        return np.ascontiguousarray(image.reshape(-1, 3)[self._places].T)
+
+    @cached_property
+    def taught_pixels(self) -> Floats:
+        """Colours (3, M) inside, each channel around its mean."""
+        return np.asarray(self.pixels(self.cells.image) - self.mean[:, None], dtype=np.float32)
+
+    @cached_property
+    def rim_gradient(self) -> Floats:
+        """The gradient (2, 4096) as the rim counts."""
+        return self.gradient * self.rim.ravel()
+
+    @cached_property
+    def edginess(self) -> float:
+        """The gradient's mean square on the rim."""
+        return float((self.rim_gradient * self.gradient).sum()) + _TINY
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Whether there are edges where they belong."""
+
+    agreement: float  # of the gradient's directions, sign ignored
+    outline: float  # share of the gradient at the outline that stands across it
 
 
 def reference_of(cells: Cells) -> Reference:
     """Everything about a demonstration that does not depend on the scene."""
     solid, image = cells.solid, cells.image
     wide, far, close = (_dilated(solid, side) for side in (_RIM_PX, _OUTER_PX, _INNER_PX))
-    slope = np.dstack(slopes(solid))
+    right, down = slopes(solid)
+    normal = np.stack([right.ravel(), down.ravel()])
+    mean, variance = _spread(cells.share, cells.mean, cells.variance)
     inside = solid >= min(0.5, float(solid.max()))
     outline = Outline.of(solid)
     return Reference(
         cells,
         _normalised(wide),
         _normalised(np.clip(far - close, 0, 1)),
-        slope / max(float(np.hypot(slope[..., 0], slope[..., 1]).sum()), 1e-6),
+        normal / max(float(np.hypot(right, down).sum()), 1e-6),
         _directions(image),
         inside,
         outline,
         outline.sides(image)[0],
         Colours.of(image[inside]),
+        mean,
+        variance,
     )
 
 
-def evidence(reference: Reference, look: Look, scale: float, quality: float, lead: float) -> Floats:
+def evidence(
+    reference: Reference,
+    look: Look,
+    scale: float,
+    quality: float,
+    lead: float,
+    edges: Edges | None = None,
+) -> Floats:
     """One number for each of :data:`NAMES`.
 
     Args:
@@ -100,15 +151,18 @@ def evidence(reference: Reference, look: Look, scale: float, quality: float, lea
         scale: of that fit.
         quality: of the network, in [0, 1].
         lead: the fit's score over that of the other way round.
+        edges: of that look; None: they are not known yet.
     """
+    pixels = reference.pixels(look.seen)
+    edges = edges or edges_of(reference, look)
     odds = np.log(max(quality, 1e-6) / max(1 - quality, 1e-6))
     values = (
         *_of_cells(look),
-        _edge_agreement(look.seen, reference),
-        _outline_share(look.seen, reference),
+        edges.agreement,
+        edges.outline,
         *_of_outline(look.seen, reference),
-        *_of_contrast(look, reference),
-        *_of_colours(look.seen, reference),
+        *_of_contrast(look, pixels, reference),
+        *_of_colours(pixels, reference),
         abs(np.log(scale)),
         np.clip(odds, -_LARGEST_LOGIT, _LARGEST_LOGIT),
         lead,
@@ -116,17 +170,28 @@ def evidence(reference: Reference, look: Look, scale: float, quality: float, lea
     return np.array(values, np.float32)
 
 
-def firmness(reference: Reference, look: Look) -> float:
+def firmness(look: Look, edges: Edges) -> float:
     """How firmly a pose holds, to prefer one to another: its score, and edges where they belong."""
-    edges = _edge_agreement(look.seen, reference)
-    outline = _outline_share(look.seen, reference)
-    return look.score + _EDGES_COUNT * edges + _OUTLINE_COUNTS * outline
+    return look.score + _EDGES_COUNT * edges.agreement + _OUTLINE_COUNTS * edges.outline
+
+
+def edges_of(reference: Reference, look: Look) -> Edges:
+    """Edges of what is seen, next to those of the demonstration."""
+    right, down, length = _gradient(look.seen)
+    shorter = 1 / (length + _GRADIENT_NOISE)
+    across, along = reference.rim_gradient, shorter * shorter
+    together = (right * right - down * down) * across[0]
+    together += (2 * right * down) * across[1]
+    strength = (length * shorter) ** 2
+    own = float((strength * strength) @ reference.rim.ravel()) + _TINY
+    over = np.abs(right * reference.normal[0] + down * reference.normal[1])
+    return Edges(float(together @ along) / sqrt(own * reference.edginess), float(over @ shorter))
 
 
 def _of_cells(look: Look) -> tuple[float, ...]:
     """Correlation, agreement low and middle, texture, deviation."""
     cells = look.cells
-    whole = look.whole(look.trust())
+    whole = look.trusted
     live = np.where(cells.share > _LEAST_CELL * cells.share.max(), cells.share, np.float32(0))
     low, middle = _quantiles(look.agreement, live * cells.texture, (0.3, 0.5))
     expected = (cells.mean - whole.taught_mean) * np.float32(whole.gain) + whole.mean
@@ -144,40 +209,35 @@ def _of_cells(look: Look) -> tuple[float, ...]:
 def _of_outline(seen: Floats, reference: Reference) -> tuple[float, ...]:
     """What a tenth, a quarter and a half of the edges do not reach, and the colours inside."""
     inner, outer = reference.outline.sides(seen)
-    edges = np.quantile(contrasts(inner, outer), (0.1, 0.25, 0.5))
-    return (*(float(np.log1p(edge)) for edge in edges), likeness(inner, reference.rim_colours))
+    edges = np.sort(contrasts(inner, outer))
+    at = np.interp(_EDGES_AT * (len(edges) - 1), np.arange(len(edges)), edges)
+    return (*np.log1p(at).tolist(), likeness(inner, reference.rim_colours))
 
 
-def _of_contrast(look: Look, reference: Reference) -> tuple[float, ...]:
+def _of_contrast(look: Look, pixels: Floats, reference: Reference) -> tuple[float, ...]:
     """Spread, contrast gain, residual and surroundings."""
-    cells, inside = look.cells, reference.inside
-    everything = cells.share
-    (mean, variance), (taught_mean, taught) = (
-        _spread(everything, one.mean, one.variance) for one in (look, cells)
-    )
-    gain = look.whole(look.trust()).gain
-    deviation, taught_deviation = np.sqrt(variance), np.sqrt(taught)
-    light = np.float32(taught_deviation / deviation)
-    left = (look.seen[inside] - mean) * light - (cells.image[inside] - taught_mean)
+    mean, variance = _spread(look.cells.share, look.mean, look.variance)
+    light = np.float32(sqrt(reference.variance) / sqrt(variance))
+    left = (pixels - mean[:, None]) * light
+    left -= reference.taught_pixels
+    off = np.abs(left, out=left).max(axis=0)
     around = _weighed(look.seen, reference.ring)
     return (
-        float(np.log(variance / taught)),
-        float(np.log(max(gain, 0.05))),
-        float(np.median(np.abs(left).max(axis=1)) / taught_deviation),
+        log(variance / reference.variance),
+        log(max(look.trusted.gain, 0.05)),
+        float(medians(off[None])[0]) / sqrt(reference.variance),
         float(np.abs(around - mean).max()) / 50,
     )
 
 
-def _of_colours(seen: Floats, reference: Reference) -> tuple[float, ...]:
+def _of_colours(pixels: Floats, reference: Reference) -> tuple[float, ...]:
     """Tint, hue, palette and the taught object's detail."""
-    colours = Colours.of(seen[reference.inside])
-    cells, taught = reference.cells, reference.colours
-    _, variance = _spread(cells.share, cells.mean, cells.variance)
+    colours, taught = Colours.of(pixels.T), reference.colours
     return (
         colours.tint(taught),
         colours.shift(taught),
         colours.overlap(taught),
-        float(np.log(variance)),
+        log(reference.variance),
     )
 
 
@@ -188,11 +248,12 @@ def _spread(share: Floats, mean: Floats, variance: Floats) -> tuple[Floats, floa
     return middle, max(square - float(middle @ middle), 0.0) + NOISE_VARIANCE
 
 
-def _quantiles(values: Floats, weight: Floats, at: tuple[float, ...]) -> tuple[float, ...]:
+def _quantiles(values: Floats, weight: Floats, at: Sequence[float]) -> list[float]:
     """Weighted quantiles of values (C,)."""
     order = np.argsort(values, kind="stable")
     below = np.cumsum(weight[order], dtype=np.float64) / max(float(weight.sum()), 1e-9)
-    return tuple(float(np.interp(q, below, values[order])) for q in at)
+    found: list[float] = np.interp(at, below, values[order]).tolist()
+    return found
 
 
 def _dilated(solid: Floats, side: int) -> Floats:
@@ -208,27 +269,15 @@ def _weighed(image: Floats, weight: Floats) -> Floats:
     return np.asarray(weight.ravel() @ image.reshape(-1, 3), dtype=np.float32)
 
 
-def _grey(image: Floats) -> Floats:
-    return np.asarray(image @ np.full(3, 1 / 3, np.float32))
+def _gradient(image: Floats) -> tuple[Floats, Floats, Floats]:
+    """Of an image's brightness (64, 64, 3): to the right, down, and its length (4096,)."""
+    grey = (image.reshape(-1, 3) @ _GREY).reshape(image.shape[:2])
+    right, down = (one.ravel() for one in slopes(grey))
+    return right, down, np.sqrt(right * right + down * down)
 
 
 def _directions(image: Floats) -> Floats:
-    """Twice the gradient's angle as (cosine, sine), shorter where the gradient is weak."""
-    right, down = slopes(_grey(image))
-    size = np.hypot(right, down) + _GRADIENT_NOISE
-    double = np.dstack([right * right - down * down, 2 * right * down])
-    return np.asarray(double / (size * size)[..., None], dtype=np.float32)
-
-
-def _edge_agreement(seen: Floats, reference: Reference) -> float:
-    here, there, weight = _directions(seen), reference.gradient, reference.rim[..., None]
-    both = float((here * there * weight).sum())
-    size = float((here * here * weight).sum()) + 1e-4
-    return both / float(np.sqrt(size * (float((there * there * weight).sum()) + 1e-4)))
-
-
-def _outline_share(seen: Floats, reference: Reference) -> float:
-    right, down = slopes(_grey(seen))
-    normal = reference.normal
-    across = np.abs(right * normal[..., 0] + down * normal[..., 1])
-    return float((across / (np.hypot(right, down) + _GRADIENT_NOISE)).sum())
+    """Twice the gradient's angle as (cosine, sine) (2, 4096), shorter where it is weak."""
+    right, down, length = _gradient(image)
+    double = np.stack([right * right - down * down, 2 * right * down])
+    return np.asarray(double / (length + _GRADIENT_NOISE) ** 2, dtype=np.float32)

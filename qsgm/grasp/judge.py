@@ -8,6 +8,7 @@ best of a coarse look is often not the right one. Of the best the two ways round
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,9 @@ from qsgm.grasp.correlation import (
     pyramid_of,
 )
 from qsgm.grasp.crops import HALF_CROP_PX
-from qsgm.grasp.evidence import Reference, evidence, firmness, reference_of
+from qsgm.grasp.evidence import Edges, Reference, edges_of, evidence, firmness, reference_of
 from qsgm.grasp.patch import PATCH_PX, Patch
-from qsgm.grasp.snapping import snapped
+from qsgm.grasp.snapping import Snapper
 
 CELL_PX = 16
 # Cells of the heatmap that the patch is laid over, and how many places are judged.
@@ -38,7 +39,7 @@ _SNAPPED = 2
 # What the network's log odds count beside a correlation when poses are chosen.
 _QUALITY_WEIGHT = 0.02
 # Poses closer than that [px, rad] are the same one, by coarse looks and by closer ones.
-_SAME_POSE = (20.0, np.deg2rad(25)), (10.0, np.deg2rad(17))
+_SAME_POSE = (20.0, math.radians(25)), (10.0, math.radians(17))
 # Closer than that, two candidates are the same place.
 _SAME_PX = 24.0
 # Where a pose fits so well, the object is there, and no other place is looked at closer by edges.
@@ -46,7 +47,7 @@ _FITS_WELL = 0.8
 # What alignment by pixels has to gain over the pose that edges gave.
 _LEAST_GAIN = 0.02
 # Turns that differ from a half turn by less are the opposite way round.
-_OPPOSITE_RAD = np.deg2rad(30)
+_OPPOSITE_RAD = math.radians(30)
 # With such a lead at a quarter of the resolution the other way round need not be looked at closer.
 _CLEAR_LEAD = 0.2
 
@@ -64,6 +65,11 @@ class Appearance:
         template = Template(patch)
         aligner = Aligner.of(template)
         return Appearance(template, reference_of(aligner.cells), aligner)
+
+    @cached_property
+    def snapper(self) -> Snapper:
+        """Made when it is first needed."""
+        return Snapper.of(self.reference)
 
     def center_of(self, fit: Fit) -> tuple[float, float]:
         """Where the object's centre (x, y) is in the frame that a fit lies over."""
@@ -94,18 +100,28 @@ class _Pose:
 
     @property
     def promise(self) -> float:
-        odds = np.log(max(self.quality, 1e-6) / max(1 - self.quality, 1e-6))
-        return self.fit.score + _QUALITY_WEIGHT * float(np.clip(odds, -8, 8))
+        odds = math.log(max(self.quality, 1e-6) / max(1 - self.quality, 1e-6))
+        return self.fit.score + _QUALITY_WEIGHT * min(max(odds, -8.0), 8.0)
 
 
 @dataclass(frozen=True)
 class _Laid:
     """A pose after it was aligned exactly."""
 
+    reference: Reference
     pose: _Pose  # before
     fit: Fit
     look: Look
-    firmness: float
+
+    @cached_property
+    def edges(self) -> Edges:
+        """What the demonstration's edges find there."""
+        return edges_of(self.reference, self.look)
+
+    @cached_property
+    def firmness(self) -> float:
+        """How firmly it holds there."""
+        return firmness(self.look, self.edges)
 
 
 def judge(
@@ -152,8 +168,8 @@ def best_fit(
     poses = [_closer(appearance.template, scene, _Pose(fit, (0, 0), 0.5)) for fit in fits]
     laid = _all_aligned(appearance, scene, poses)
     best = max(laid, key=lambda one: one.firmness)
-    fit, _, lead = _better_way_round(appearance, scene, best, laid)
-    return fit, lead
+    better, lead = _better_way_round(appearance, scene, best, laid)
+    return better.fit, lead
 
 
 def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
@@ -168,65 +184,62 @@ def _closer(template: Template, scene: Pyramid, pose: _Pose) -> _Pose:
 
 def _all_aligned(appearance: Appearance, scene: Pyramid, poses: Sequence[_Pose]) -> list[_Laid]:
     """Poses aligned by pixels; the firmest few by edges, too, if none fits well."""
-    laid = []
-    for pose in poses:
-        way = appearance.aligner.aligned(scene, pose.fit)
-        laid.append(_Laid(pose, *way, firmness(appearance.reference, way[1])))
+    laid = [_aligned(appearance, scene, pose, pose.fit) for pose in poses]
     laid.sort(key=lambda one: -one.firmness)
     if max(one.fit.score for one in laid) >= _FITS_WELL:
         return laid
     return [_by_edges(appearance, scene, one) for one in laid[:_SNAPPED]] + laid[_SNAPPED:]
 
 
+def _aligned(appearance: Appearance, scene: Pyramid, pose: _Pose, start: Fit) -> _Laid:
+    return _Laid(appearance.reference, pose, *appearance.aligner.aligned(scene, start))
+
+
 def _by_edges(appearance: Appearance, scene: Pyramid, laid: _Laid) -> _Laid:
     """The same pose moved to where its edges are, if it holds more firmly there."""
-    reference, aligner = appearance.reference, appearance.aligner
-    moved = snapped(reference, scene, laid.fit)
-    look = aligner.look(scene, moved)
-    ways = [(replace(moved, score=look.score), look)]
-    again, seen = aligner.aligned(scene, moved)
-    if again.score > look.score + _LEAST_GAIN:
-        ways.append((again, seen))
-    others = [_Laid(laid.pose, *way, firmness(reference, way[1])) for way in ways]
-    return max((laid, *others), key=lambda one: one.firmness)
+    moved = appearance.snapper.snapped(scene, laid.fit)
+    look = appearance.aligner.look(scene, moved)
+    ways = [laid, replace(laid, fit=replace(moved, score=look.score), look=look)]
+    again = _aligned(appearance, scene, laid.pose, moved)
+    if again.fit.score > look.score + _LEAST_GAIN:
+        ways.append(again)
+    return max(ways, key=lambda one: one.firmness)
 
 
 def _candidate(
     appearance: Appearance, scene: Pyramid, laid: _Laid, others: Sequence[_Laid]
 ) -> Candidate:
     pose = laid.pose
-    fit, look, lead = _better_way_round(appearance, scene, laid, others)
-    facts = evidence(appearance.reference, look, fit.scale, pose.quality, lead)
+    better, lead = _better_way_round(appearance, scene, laid, others)
+    fit, edges = better.fit, better.edges
+    facts = evidence(appearance.reference, better.look, fit.scale, pose.quality, lead, edges)
     center = appearance.center_of(fit)
     cell = cell_center(pose.cell)
-    return Candidate(fit, facts, look.picture, center, cell, lead, pose.quality)
+    return Candidate(fit, facts, better.look.picture, center, cell, lead, pose.quality)
 
 
 def _better_way_round(
     appearance: Appearance, scene: Pyramid, laid: _Laid, others: Sequence[_Laid]
-) -> tuple[Fit, Look, float]:
-    """The better of the fit and its opposite, laid exactly, and its lead over the other."""
-    fit, look = laid.fit, laid.look
-    found = [one for one in others if _is_opposite(appearance, fit, one.fit)]
+) -> tuple[_Laid, float]:
+    """The better of a pose and its opposite, laid exactly, and its lead over the other."""
+    found = [one for one in others if _is_opposite(appearance, laid.fit, one.fit)]
     if found:
-        best = max(found, key=lambda one: one.firmness)
-        opposite, its_look = best.fit, best.look
+        opposite = max(found, key=lambda one: one.firmness)
     else:
         start = laid.pose.fit
         other = _opposite(appearance, scene, start)
         if start.score - other.score > _CLEAR_LEAD:
-            return fit, look, start.score - other.score
-        opposite, its_look = appearance.aligner.aligned(scene, other)
-    if opposite.score > fit.score:
-        return opposite, its_look, opposite.score - fit.score
-    return fit, look, fit.score - opposite.score
+            return laid, start.score - other.score
+        opposite = _aligned(appearance, scene, laid.pose, other)
+    lead = laid.fit.score - opposite.fit.score
+    return (opposite, -lead) if lead < 0 else (laid, lead)
 
 
 def _is_opposite(appearance: Appearance, one: Fit, other: Fit) -> bool:
     """Whether two fits lie on the same place, the ways round about opposite."""
     apart = math.dist(appearance.center_of(one), appearance.center_of(other))
-    turned = np.cos(one.turn_rad - other.turn_rad) < -np.cos(_OPPOSITE_RAD)
-    return bool(apart < _SAME_PX and turned)
+    turned = math.cos(one.turn_rad - other.turn_rad) < -math.cos(_OPPOSITE_RAD)
+    return apart < _SAME_PX and turned
 
 
 def _opposite(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
@@ -239,9 +252,9 @@ def _opposite(appearance: Appearance, scene: Pyramid, fit: Fit) -> Fit:
 
 def _laid(fit: Fit, x: float, y: float) -> tuple[float, float]:
     """Where a point (x, y) [px] from the patch's middle lies in the frame."""
-    cos, sin = fit.scale * np.cos(fit.turn_rad), fit.scale * np.sin(fit.turn_rad)
+    cos, sin = fit.scale * math.cos(fit.turn_rad), fit.scale * math.sin(fit.turn_rad)
     center_x, center_y = fit.center_px
-    return float(center_x + cos * x + sin * y), float(center_y - sin * x + cos * y)
+    return center_x + cos * x + sin * y, center_y - sin * x + cos * y
 
 
 def _different(poses: Sequence[_Pose], count: int, near_px: float, near_rad: float) -> list[_Pose]:
@@ -256,8 +269,9 @@ def _different(poses: Sequence[_Pose], count: int, near_px: float, near_rad: flo
 
 
 def _nearly_same(one: Fit, other: Fit, near_px: float, near_rad: float) -> bool:
-    alike = np.cos(one.turn_rad - other.turn_rad) > np.cos(near_rad)
-    return bool(alike and math.dist(one.center_px, other.center_px) < near_px)
+    if math.dist(one.center_px, other.center_px) >= near_px:
+        return False
+    return math.cos(one.turn_rad - other.turn_rad) > math.cos(near_rad)
 
 
 def _apart(appearance: Appearance, laid: Sequence[_Laid], count: int) -> list[_Laid]:

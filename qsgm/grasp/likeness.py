@@ -60,6 +60,6 @@ def inner_variance(patch: Patch) -> float:
 def likeness_by_turn(appearance: Appearance, image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Correlation of a patch (160, 160, 3) with itself, turned in steps of 15 degrees: (24,)."""
     trials = appearance.template.trials(COARSE, _TURNS)
-    windows, _ = windows_around(pyramid_of(image), COARSE, (_MIDDLE_PX, _MIDDLE_PX), 1)
-    scores, _, _ = correlate(windows, trials)
-    return np.asarray(scores.max(axis=0))
+    middle = _MIDDLE_PX, _MIDDLE_PX
+    windows, _ = windows_around(pyramid_of(image), COARSE, middle, 1, trials.live)
+    return np.asarray(correlate(windows, trials).max(axis=0))

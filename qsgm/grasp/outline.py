@@ -5,6 +5,7 @@ no edge where the taught one ends.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -41,15 +42,21 @@ class Outline:
         outer = np.concatenate([points - near, points - far])
         return Outline(*(one.astype(np.float32) for one in (points, inward, inner, outer)))
 
-    def across(self, image: Floats, offsets: Floats) -> Floats:
-        """Colours (N, M, 3) at M offsets [px] from each point, inside ones negative."""
+    def lines(self, offsets: Floats) -> tuple[Floats, Floats]:
+        """Where (x, y), each (N, M), lines across the outline are, M offsets [px], inside < 0."""
         at = self.points[:, None] - offsets[:, None] * self.inward[:, None]
-        colours = _sampled(image, at.reshape(-1, 2))
-        return colours.reshape(len(at), len(offsets), -1)
+        return np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
 
     def sides(self, image: Floats) -> tuple[Floats, Floats]:
         """Colours (N, 3) just inside and just outside, in an image (h, w, 3)."""
-        return _mean_of_two(_sampled(image, self.inner)), _mean_of_two(_sampled(image, self.outer))
+        near_in, far_in, near_out, far_out = sampled(image, *self._sides).reshape(4, -1, 3)
+        return _middle(near_in, far_in), _middle(near_out, far_out)
+
+    @cached_property
+    def _sides(self) -> tuple[Floats, Floats]:
+        """Where (x, y) both sides are, each (1, 4 N)."""
+        x, y = np.concatenate([self.inner, self.outer]).T
+        return np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
 
 
 def contrasts(inside: Floats, outside: Floats) -> Floats:
@@ -85,12 +92,11 @@ def _inward(solid: Floats, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(across / np.maximum(length, 1e-9)[:, None])
 
 
-def _sampled(image: Floats, points: Floats) -> Floats:
-    x, y = np.ascontiguousarray(points[None, :, 0]), np.ascontiguousarray(points[None, :, 1])
+def _middle(one: Floats, other: Floats) -> Floats:
+    return np.asarray((one + other) / 2, dtype=np.float32)
+
+
+def sampled(image: Floats, x: Floats, y: Floats) -> Floats:
+    """Colours (N, M, 3) of an image between its pixels, at places (N, M)."""
     found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found[0], dtype=np.float32)
-
-
-def _mean_of_two(colours: Floats) -> Floats:
-    near, far = np.split(colours, 2)
-    return np.asarray((near + far) / 2, dtype=np.float32)
+    return np.asarray(found, dtype=np.float32)

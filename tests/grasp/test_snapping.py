@@ -9,7 +9,6 @@ from toys import lay, plain, table, toy
 from qsgm.grasp.correlation import Fit, pyramid_of
 from qsgm.grasp.judge import Appearance
 from qsgm.grasp.patch import cut_patch
-from qsgm.grasp.snapping import snapped
 
 CENTER = (320.0, 240.0)
 
@@ -29,7 +28,7 @@ def test_a_plain_object_on_another_table_is_brought_to_its_edges(seed: int) -> N
     scene = pyramid_of(lay(plain(), table(seed + 1, grey=60), CENTER, turn))
     x, y = np.array(CENTER) - 0.5 + rng.uniform(-4, 4, 2)
     start = Fit(0.5, math.radians(turn + rng.uniform(-7, 7)), rng.uniform(0.95, 1.05), (x, y))
-    moved = snapped(PLAIN.reference, scene, start)
+    moved = PLAIN.snapper.snapped(scene, start)
     off, turned = errors(PLAIN, moved, turn)
     assert off < 2
     assert turned < 2
@@ -41,13 +40,13 @@ def test_a_fit_that_is_right_stays() -> None:
     scene = pyramid_of(lay(toy(), table(3), CENTER, 33))
     fit, _ = appearance.aligner.aligned(scene, Fit(0.0, math.radians(35), 1.0, (321.0, 239.0)))
     assert errors(appearance, fit, 33)[0] < 0.3
-    off, turned = errors(appearance, snapped(appearance.reference, scene, fit), 33)
+    off, turned = errors(appearance, appearance.snapper.snapped(scene, fit), 33)
     assert off < 1
     assert turned < 1
 
 
 def test_where_there_is_no_edge_a_fit_stays_near() -> None:
     scene = pyramid_of(np.full((480, 640, 3), 120, np.uint8))
-    moved = snapped(PLAIN.reference, scene, Fit(0.1, 0.4, 1.0, CENTER))
+    moved = PLAIN.snapper.snapped(scene, Fit(0.1, 0.4, 1.0, CENTER))
     assert math.dist(moved.center_px, CENTER) < 1
     assert moved.turn_rad == pytest.approx(0.4, abs=0.02)

@@ -1,5 +1,7 @@
 """The comparer learns what is alike; what it learns from is the object where it says so."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from toys import lay, table, toy
@@ -61,9 +63,8 @@ def test_it_learns_to_tell_what_is_alike_from_what_is_not() -> None:
     examples, steps = alike_or_not(), list[tuple[int, int]]()
     learnt = train_comparer(examples, SMALL, 0, lambda done, of: steps.append((done, of)))
     assert steps[-1][0] == steps[-1][1] == SMALL.passes * len(examples) // SMALL.batch
-    cells = CELLS
-    whole = Cells(**(vars(cells) | {"image": examples.taught[0].astype(np.float32)}))
-    whole = Cells(**(vars(whole) | {"solid": np.ones((64, 64), np.float32)}))
+    taught, everywhere = examples.taught[0].astype(np.float32), np.ones((64, 64), np.float32)
+    whole = replace(CELLS, image=taught, solid=everywhere)
     logits = learnt.logits(whole, examples.seen)
     assert (logits[examples.mine] > logits[~examples.mine].max()).mean() > 0.95
 
