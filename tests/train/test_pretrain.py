@@ -97,6 +97,8 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
         "meta",
         "early",
         "rates",
+        "examples",
+        "comparer",
         "decision",
     ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
@@ -345,7 +347,7 @@ def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path
         after_interruption = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
-    late = ("tasks", "matching", "meta", "early", "rates", "decision")
+    late = ("tasks", "matching", "meta", "early", "rates", "examples", "comparer", "decision")
     assert threads == {"backbone": 2} | dict.fromkeys(late, 1)
     assert (after, after_interruption) == (2, 2)
 
