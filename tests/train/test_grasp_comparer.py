@@ -1,14 +1,18 @@
 """The comparer learns what is alike; what it learns from is the object where it says so."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from numpy.typing import NDArray
 from toys import lay, table, toy
 
 from qsgm.grasp.cells import Cells
 from qsgm.grasp.correlation import Template
 from qsgm.grasp.patch import cut_patch
+from qsgm.train.grasp import comparer
 from qsgm.train.grasp.comparer import (
     Batch,
     ComparerConfig,
@@ -19,6 +23,7 @@ from qsgm.train.grasp.comparer import (
     train_comparer,
     varied,
 )
+from qsgm.train.grasp.episodes import Episode, EpisodeMaker
 
 CENTER = (320.0, 240.0)
 CELLS = Cells.of(Template(cut_patch(lay(toy(), table(), CENTER), CENTER)))
@@ -37,6 +42,12 @@ def alike_or_not(count: int = 64) -> Examples:
     noisy = np.clip(seen + rng.normal(0, 6, seen.shape), 0, 255).astype(np.uint8)
     solid = np.full((1, 64, 64), 255, np.uint8)
     return Examples(taught, solid, noisy, np.zeros(count, np.int64), mine)
+
+
+def nowhere(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The heatmap of a network that sees nothing."""
+    rows, cols = ((side - 128) // 16 + 1 for side in frame.shape[:2])
+    return np.full((3, rows, cols), 0.5, np.float32)
 
 
 def test_what_is_frozen_answers_as_what_was_learnt() -> None:
@@ -85,15 +96,29 @@ def test_varied_examples_keep_the_object_where_its_mask_is() -> None:
         assert batch.seen.max() <= 255
 
 
+def test_another_thing_where_the_object_was_is_not_the_object(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever lies in scenes without it, no example of these is the object's."""
+    config = replace(SMALL, scenes=4)
+    monkeypatch.setattr(comparer, "_at_true_pose", lambda *_: iter(()))
+    draw = EpisodeMaker.draw
+
+    def without_alone(*given: Any, **more: Any) -> Episode:
+        episode = draw(*given, **more)
+        assert any(scene.mask.any() for scene in episode.without), "a thing lies there"
+        return replace(episode, scenes=())
+
+    monkeypatch.setattr(EpisodeMaker, "draw", without_alone)
+    examples = draw_examples(nowhere, config, 1, lambda: None)
+    assert len(examples) > 0
+    assert not examples.mine.any()
+
+
 def test_examples_show_the_object_where_they_say_so() -> None:
     """A network that sees nothing proposes places anywhere; the true poses are there anyway."""
-
-    def look(frame: np.ndarray) -> np.ndarray:
-        rows, cols = ((side - 128) // 16 + 1 for side in frame.shape[:2])
-        return np.full((3, rows, cols), 0.5, np.float32)
-
     told = list[int]()
-    examples = draw_examples(look, SMALL, 3, lambda: told.append(1))
+    examples = draw_examples(nowhere, SMALL, 3, lambda: told.append(1))
     assert len(told) == len(examples.taught) == 1
     assert examples.mine.any()
     assert not examples.mine.all()

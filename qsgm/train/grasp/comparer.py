@@ -104,12 +104,13 @@ def draw_examples(
 
 def _views(appearance: Appearance, episode: Episode, look: Look) -> Iterator[tuple[Image, bool]]:
     """What lies at the candidates of all scenes (64, 64, 3), and whether it is the object."""
-    for scene in (*episode.scenes, *episode.without):
-        center = scene.center_px
-        for one in judge(appearance, scene.image, look(scene.image)):
-            off = math.inf if center is None else math.dist(one.center_px, center)
-            if not ON_OBJECT_PX < off < OFF_OBJECT_PX:
-                yield one.seen, off <= ON_OBJECT_PX
+    for scenes, is_there in ((episode.scenes, True), (episode.without, False)):
+        for scene in scenes:  # without it another thing may be where it was
+            for one in judge(appearance, scene.image, look(scene.image)):
+                center = scene.center_px if is_there else None
+                off = math.inf if center is None else math.dist(one.center_px, center)
+                if not ON_OBJECT_PX < off < OFF_OBJECT_PX:
+                    yield one.seen, off <= ON_OBJECT_PX
     turn = episode.demonstration.turn_rad
     for scene in episode.scenes:
         yield from _at_true_pose(appearance, scene, turn)
