@@ -20,7 +20,6 @@ from qsgm.cli.console import (
 )
 from qsgm.cli.options import (
     ActivationBitsChoice,
-    AnyDistanceOption,
     BlocksOption,
     BundleOption,
     CalibratorName,
@@ -269,7 +268,14 @@ def predict(
     everything: Annotated[
         bool, typer.Option("--all", help="List every instance of the object.")
     ] = False,
-    any_distance: AnyDistanceOption = False,
+    any_distance: Annotated[
+        bool | None,
+        typer.Option(
+            "--any-distance/--same-distance",
+            help="Where it is not found, look at half to twice the distance, too.",
+            show_default="any, but with --all",
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,
@@ -289,7 +295,7 @@ def predict(
     if everything and any_distance:
         raise typer.BadParameter("--all looks at the demonstration's distance only")
     folders = find_objects(tuned or ())
-    grasping = {"all": everything, "any_distance": any_distance, "output": output is not None}
+    grasping = {"all": everything, "any_distance": bool(any_distance), "output": output is not None}
     if predict_task(folders, task, scene, threads, as_json, grasping):
         return
     if output is not None:
@@ -297,7 +303,8 @@ def predict(
         check_output(output, scene)
     objects = load_objects(folders, threads)
     frame = read_frame(scene)
-    sights = look_for_each(objects, frame, everything=everything, any_distance=any_distance)
+    anywhere = not everything if any_distance is None else any_distance
+    sights = look_for_each(objects, frame, everything=everything, any_distance=anywhere)
     if output is not None:
         write_png(output, sights_picture(frame, sights))
     show(sights_json(sights, output), sights_table(sights), as_json)
