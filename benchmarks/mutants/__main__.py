@@ -117,7 +117,6 @@ def run(
     from covered import FIXTURE, Covered
 
     tree, log = work / "tree", work / "log"
-    _restore(work)
     covered = Covered(tree, work / "coverage", work / "tests.json")
     if again:
         shutil.rmtree(tree / "tests")
@@ -339,6 +338,10 @@ def main() -> None:
     if given.what == "collect":
         collect(work)
         return
+    if given.what == "run":
+        _restore(work)
+    if (work / "changed").exists():  # what is drawn would be changed twice
+        raise SystemExit("a run goes on, or was stopped in its middle: let it come to its end first")
     mutants = drawn(work / "tree", given.seed, given.count)
     if given.what == "run":
         run(work, mutants, given.seconds, given.again)
