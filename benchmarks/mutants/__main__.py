@@ -341,7 +341,7 @@ def main() -> None:
     if given.what == "run":
         _restore(work)
     if (work / "changed").exists():  # what is drawn would be changed twice
-        raise SystemExit("a run goes on, or was stopped in its middle: let it come to its end first")
+        raise SystemExit("a run goes on, or was stopped in its middle: let it end first")
     mutants = drawn(work / "tree", given.seed, given.count)
     if given.what == "run":
         run(work, mutants, given.seconds, given.again)
