@@ -213,6 +213,7 @@ def test_the_caption_says_what_was_found_in_words_and_numbers() -> None:
         "turn (counter-clockwise)": "-30.0 deg",
         "quality": "0.90",
     }
+    assert dict(_values(detection(angle_deg=-0.04)))["turn (counter-clockwise)"] == "+0.0 deg"
     same = draw_detection(FRAME, NOTHING, turned, "mug")
     other = draw_detection(FRAME, NOTHING, turned, "cup")
     changed = (same != other).any(axis=2)
