@@ -380,21 +380,34 @@ def test_a_stale_workshop_is_swept_and_one_at_work_is_left_alone(tmp_path: Path)
     assert (tmp_path / "mug" / MARKER).read_text() == "what was to be replaced"
 
 
-def test_what_is_removed_stays_so_whatever_ends_the_machine(
+def test_what_is_removed_is_gone_from_the_disk_before_any_of_it_is_torn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not Path("/proc/self/fd").exists():
         pytest.skip("there is no /proc")
     write_object(tmp_path / "mug")
-    synced: list[tuple[Path, bool]] = []
+    synced: list[tuple[Path, bool, bool]] = []
 
     def note(descriptor: int) -> None:
         folder = Path(f"/proc/self/fd/{descriptor}").readlink()
-        synced.append((folder, (tmp_path / "mug").exists()))
+        whole = any(tmp_path.rglob(f".qsgm-*/**/{MARKER}"))
+        synced.append((folder, (tmp_path / "mug").exists(), whole))
 
     monkeypatch.setattr(os, "fsync", note)
     remove_folder(tmp_path / "mug", MARKER)
-    assert (tmp_path, False) in synced
+    assert (tmp_path, False, True) in synced
+
+
+def test_a_removal_that_the_disk_did_not_confirm_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    write_object(tmp_path / "mug")
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(QsgmError, match="input/output error"):
+        remove_folder(tmp_path / "mug", MARKER)
 
 
 def test_a_folder_is_read_again_only_if_it_was_replaced(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_fields_of_fixed_length_are_passed_over() -> None:
 @pytest.mark.parametrize(
     "field",
     [
-        *(bytes([8 | kind, 1]) for kind in (3, 4, 6, 7)),  # groups, and kinds that there are not
+        *(bytes([8 | kind]) for kind in (3, 4, 6, 7)),  # groups, and kinds that there are not
         b"\x88\x80\x80\x80\x10\x01",  # a tag of 33 bits, of which protobuf may take 32
     ],
 )
