@@ -18,6 +18,7 @@ from qsgm.files import (
     new_folder,
     read_file,
     read_whole,
+    remove_folder,
     write_bytes_atomic,
     write_text_atomic,
 )
@@ -314,6 +315,20 @@ def test_a_file_that_says_it_has_no_size_is_read_to_its_end_or_its_budget() -> N
     assert "expected a note of at most" in refused_read(Path("/proc/self/status"), 10)
 
 
+def test_a_file_that_grows_to_its_budget_while_it_is_read_is_read_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_bytes(b"x" * 20)
+    status = os.fstat
+
+    def of_before(descriptor: int) -> os.stat_result:
+        return os.stat_result([*status(descriptor)[:6], 10, *status(descriptor)[7:10]])
+
+    monkeypatch.setattr(os, "fstat", of_before)
+    assert len(read_file(tmp_path / "file", 20, "a note")) == 20
+    assert "has 2e-05 MB" in refused_read(tmp_path / "file", 11)  # what was read at first fits
+
+
 def test_a_file_nobody_may_read_or_memory_is_too_small_for_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -363,6 +378,36 @@ def test_a_stale_workshop_is_swept_and_one_at_work_is_left_alone(tmp_path: Path)
         (inside / MARKER).write_text("{}")
     assert names(tmp_path) == [".qsgm-mine", "cup", "file", "mug"]
     assert (tmp_path / "mug" / MARKER).read_text() == "what was to be replaced"
+
+
+def test_what_is_removed_is_gone_from_the_disk_before_any_of_it_is_torn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("there is no /proc")
+    write_object(tmp_path / "mug")
+    synced: list[tuple[Path, bool, bool]] = []
+
+    def note(descriptor: int) -> None:
+        folder = Path(f"/proc/self/fd/{descriptor}").readlink()
+        whole = any(tmp_path.rglob(f".qsgm-*/**/{MARKER}"))
+        synced.append((folder, (tmp_path / "mug").exists(), whole))
+
+    monkeypatch.setattr(os, "fsync", note)
+    remove_folder(tmp_path / "mug", MARKER)
+    assert (tmp_path, False, True) in synced
+
+
+def test_a_removal_that_the_disk_did_not_confirm_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    write_object(tmp_path / "mug")
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(QsgmError, match="input/output error"):
+        remove_folder(tmp_path / "mug", MARKER)
 
 
 def test_a_folder_is_read_again_only_if_it_was_replaced(tmp_path: Path) -> None:

@@ -278,8 +278,8 @@ def test_of_clips_that_lose_as_little_entropy_takes_the_widest() -> None:
 @pytest.mark.parametrize("name", sorted(CALIBRATORS))
 def test_every_tensor_of_an_sgm_has_its_calibrators_range(name: str, levels: int) -> None:
     values = heavy_tailed("student")
-    hidden = [np.maximum(values[:, :2], 0), np.maximum(values, 0)]
-    shapes = ((2, 6), (3, 2), (3, 3))  # three inputs and a label; hidden, hidden, gradient
+    hidden = [np.maximum(values, 0), np.maximum(values[:, :2], 0)]
+    shapes = ((3, 6), (2, 3), (3, 2))  # three inputs and a label; hidden, hidden, gradient
     convs = [
         FoldedConv(np.zeros((o, i, 1, 1), np.float32), np.zeros(o, np.float32)) for o, i in shapes
     ]

@@ -71,6 +71,13 @@ def test_a_run_that_gives_its_memory_back_gives_the_same(bundle: Bundle) -> None
     np.testing.assert_array_equal(again, plain)
 
 
+def test_a_session_has_one_thread_unless_more_are_asked_for() -> None:
+    model = model_of(graph_with([onnx.numpy_helper.from_array(np.ones(2, np.float32), "secret")]))
+    for more, expected in (({}, 1), ({"threads": 2}, 2)):
+        options = open_session(model.SerializeToString(), **more).get_session_options()
+        assert options.intra_op_num_threads == expected
+
+
 def test_what_is_no_graph_is_refused_in_one_line() -> None:
     with pytest.raises(QsgmError, match="cannot load a graph") as raised:
         open_session(b"not a graph")
@@ -159,6 +166,29 @@ def test_only_the_files_that_belong_to_a_model_are_its_own(
     model = model_of(graph_with([tensor])).SerializeToString()
     with pytest.raises(QsgmError, match=expected):
         open_session(model, files={"weights.bin": bytes(8)})
+
+
+def test_fields_of_fixed_length_are_passed_over() -> None:
+    whole = model_of(graph_with([tensor_in("weights.bin")])).SerializeToString()
+    fixed = b"\xa1\x06" + bytes(8) + b"\xa5\x06" + bytes(4)  # field 100 in 64 bits, and in 32
+    onnx.load_model_from_string(fixed + whole)
+    check_external_data(fixed + whole, {"weights.bin": b""})
+    with pytest.raises(ValueError, match=r"'weights\.bin'"):
+        check_external_data(fixed + whole, {})
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        *(bytes([8 | kind]) for kind in (3, 4, 6, 7)),  # groups, and kinds that there are not
+        b"\x88\x80\x80\x80\x10\x01",  # a tag of 33 bits, of which protobuf may take 32
+    ],
+)
+def test_a_field_that_may_be_read_in_another_way_is_refused(field: bytes) -> None:
+    whole = model_of(graph_with()).SerializeToString()
+    check_external_data(whole, {})
+    with pytest.raises(ValueError, match="not an ONNX file"):
+        check_external_data(whole + field, {})
 
 
 def test_a_tensor_that_is_described_twice_is_refused() -> None:

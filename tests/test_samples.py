@@ -191,6 +191,14 @@ def test_a_task_file_that_is_none_is_refused_in_one_line(
     assert said in refused(lambda: load_task(path))
 
 
+def test_a_task_file_of_more_than_a_megabyte_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "long.py"
+    path.write_text("#" * 999_999 + "\n")
+    assert "`task` is nothing" in refused(lambda: load_task(path))  # it was run
+    path.write_text("#" * 1_000_000 + "\n")
+    assert "at most 1 MB" in refused(lambda: load_task(path))
+
+
 def test_what_a_task_file_raises_while_it_reads_is_one_line() -> None:
     class Wrong(SampleTask):
         def read(self, path: Path) -> Samples:

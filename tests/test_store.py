@@ -92,6 +92,12 @@ def test_show_says_what_reading_the_graph_takes(qsgm: Run, mug: Path) -> None:
     assert str(mug)[-20:] in qsgm("objects", "show", mug).out.replace("\n", "").replace(" ", "")
 
 
+def test_what_is_shown_starts_at_the_left(qsgm: Run, mug: Path) -> None:
+    lines = [line for line in qsgm("objects", "show", mug).out.splitlines() if line.strip()]
+    starts = {len(line) - len(line.lstrip()) for line in lines if "  made: " in line}
+    assert starts == {2}
+
+
 def test_an_object_is_found_by_name_or_folder_and_without_its_bundle(
     qsgm: Run,
     mug: Path,

@@ -44,7 +44,7 @@ HERE = Path(__file__).resolve().parent
 TREE = HERE.parents[1]
 NEEDED = ("qsgm", "tests", "benchmarks", "examples", "deploy", "docs", "calib", "export")
 FETCHED = ("node_modules", "build")
-# Of CPU that a mutant may take before it counts as endless.
+# Of CPU that a mutant may take, beside three times what its tests do, before it counts as endless.
 MOST_SECONDS = 60
 MOST_BYTES = 16 * 2**30
 BUNDLE = "bundle_folder"  # the fixture
@@ -117,19 +117,19 @@ def run(
     from covered import FIXTURE, Covered
 
     tree, log = work / "tree", work / "log"
-    _restore(work)
     covered = Covered(tree, work / "coverage", work / "tests.json")
     if again:
         shutil.rmtree(tree / "tests")
         shutil.copytree(TREE / "tests", tree / "tests")
     known = {name: entry["result"] for name, entry in _results(log).items()}
-    wanted = None if again is None else "survived"
+    wanted = (None,) if again is None else ("survived", "stuck")
     trials = []
     for mutant in mutants:
-        if known.get(mutant.name) == wanted:
+        if known.get(mutant.name) in wanted:
             tests = list(again) if again else _chosen(covered, mutant, most_seconds)
             makes = f"{FIXTURE}{BUNDLE}" in covered.contexts_of(mutant)
-            trials.append(Trial(mutant, tests, makes))
+            usual = sum(covered.seconds.get(name, 0) for name in tests)
+            trials.append(Trial(mutant, tests, makes, MOST_SECONDS + round(3 * usual)))
     _load(tree)
     os.chdir(tree)
     if not (work / "bundle").exists() and _code_of(lambda: _write_bundle(work / "bundle"), 600):
@@ -161,6 +161,7 @@ class Trial:
     mutant: Mutant
     tests: list[str]
     makes_bundle: bool  # the mutant has a part in making what most tests share
+    most_seconds: int  # of CPU
 
 
 class Session:
@@ -248,17 +249,17 @@ def _load(tree: Path) -> None:
 
 
 def _tell(work: Path, trial: Trial, test: Callable[[], int]) -> None:
-    """Write down what tests say of a mutant: killed, endless or survived."""
+    """Write down what tests say of a mutant: killed, endless, survived; stuck: it took no CPU."""
     path, killer, began = work / "tree" / trial.mutant.path, work / "killer", time.monotonic()
     result = "survived"
     killer.unlink(missing_ok=True)
     shutil.copy(path, work / "original")
     (work / "changed").write_text(trial.mutant.path)
     path.write_text(trial.mutant.source, encoding="utf-8")  # for programs that tests start
-    code = _code_of(test, MOST_SECONDS) if trial.tests else 0
+    code = _code_of(test, trial.most_seconds) if trial.tests else 0
     _restore(work)
     if code:
-        result = "endless" if code in (-signal.SIGXCPU, -signal.SIGALRM) else "killed"
+        result = {-signal.SIGXCPU: "endless", -signal.SIGALRM: "stuck"}.get(code, "killed")
     entry = {"mutant": trial.mutant.name, "line": trial.mutant.first, "result": result}
     entry |= {"tests": len(trial.tests), "seconds": round(time.monotonic() - began, 1)}
     entry["killer"] = killer.read_text() if killer.exists() else f"exit code {code}"
@@ -313,10 +314,9 @@ def show(work: Path, mutants: Sequence[Mutant]) -> None:
     found = {one.name: results[one.name]["result"] for one in mutants if one.name in results}
     counts = Counter("equivalent" if n in same and r != "killed" else r for n, r in found.items())
     for name, result in found.items():
-        if result == "survived" and name not in same:
-            print(
-                f"survived {results[name]['tests']} tests: line {results[name]['line']} of {name}"
-            )
+        if result in ("survived", "stuck") and name not in same:
+            tests, line = results[name]["tests"], results[name]["line"]
+            print(f"{result}, {tests} tests: line {line} of {name}")
     killed = counts["killed"] + counts["endless"]
     share = killed / max(1, len(found) - counts["equivalent"])
     print(
@@ -338,6 +338,10 @@ def main() -> None:
     if given.what == "collect":
         collect(work)
         return
+    if given.what == "run":
+        _restore(work)
+    if (work / "changed").exists():  # what is drawn would be changed twice
+        raise SystemExit("a run goes on, or was stopped in its middle: let it end first")
     mutants = drawn(work / "tree", given.seed, given.count)
     if given.what == "run":
         run(work, mutants, given.seconds, given.again)

@@ -19,6 +19,7 @@ from rich.progress import (
 
 from qsgm import paths
 from qsgm.errors import QsgmError, as_text
+from qsgm.progress import ignore
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
@@ -103,6 +104,9 @@ def host_module(name: str) -> Any:
 def progress() -> Iterator[Watch]:
     """A bar per stage on stderr, on a terminal only; yields what is told about progress."""
     console = terminal(stderr=True)
+    if not console.is_terminal:  # a `Progress` that is disabled ends with an empty line in rich 13
+        yield ignore
+        return
     columns = (
         TextColumn("{task.description:>10}"),
         BarColumn(),
@@ -111,9 +115,7 @@ def progress() -> Iterator[Watch]:
         TextColumn("{task.fields[values]}"),
     )
     tasks: dict[str, TaskID] = {}
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
 
         def watch(stage: str, done: int, of: int, values: dict[str, float] | None = None) -> None:
             if stage not in tasks:

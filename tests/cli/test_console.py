@@ -65,6 +65,18 @@ def test_the_progress_says_nothing_unless_it_is_on_a_terminal(
     assert capsys.readouterr() == ("", "")
 
 
+def test_on_a_terminal_the_progress_is_on_stderr(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes any stream for a terminal then
+    monkeypatch.setenv("TERM", "xterm")
+    with console.progress() as watch:
+        watch("crops", 1, 2)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "crops" in err
+
+
 def test_the_version_and_the_help_are_printed(qsgm: Run) -> None:
     assert qsgm("--version").out == f"qsgm {__version__}\n"
     assert "finetune" in qsgm("--help").out

@@ -8,10 +8,10 @@ from toys import bump, lay, plain, table, toy
 
 from qsgm.grasp.angles import full_degrees
 from qsgm.grasp.candidates import candidate_cells
-from qsgm.grasp.correlation import Fit
+from qsgm.grasp.correlation import Fit, coarse_fits, middle_fit, pyramid_of
 from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.finding import Sighting, confidence_of
-from qsgm.grasp.judge import JUDGED, Appearance, cell_center, judge
+from qsgm.grasp.judge import JUDGED, PROPOSED, Appearance, _opposite, cell_center, judge
 from qsgm.grasp.patch import Patch, cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import _as_detection
@@ -29,6 +29,23 @@ def test_candidates_are_local_maxima_best_first() -> None:
     for i, (row, col) in enumerate(cells):
         assert all(max(abs(row - r), abs(col - c)) > 1 for r, c in cells[:i])
     assert candidate_cells(np.zeros((1, 1), np.float32), 5) == [(0, 0)]
+
+
+def test_only_a_cell_next_to_a_candidate_is_none_itself() -> None:
+    quality = np.zeros((7, 7), np.float32)
+    quality[3, 3] = 0.9
+    around = [(1, 3), (5, 3), (3, 1), (3, 5), (2, 2), (4, 4)]  # two cells away, and one
+    for cell, value in zip(around, (0.8, 0.7, 0.6, 0.5, 0.85, 0.85), strict=True):
+        quality[cell] = value
+    assert candidate_cells(quality, 5) == [(3, 3), *around[:4]]
+
+
+def test_as_many_places_are_judged_as_are_asked_for() -> None:
+    places = [(100.0 + 110 * i, 100.0 + 110 * j) for i in range(5) for j in range(3)]
+    found = judge(APPEARANCE, table(1), bump(places), count=len(places))
+    near = {min(places, key=lambda at: math.dist(at, one.cell_px)) for one in found}
+    assert len(near) > PROPOSED
+    assert len(found) <= len(places)
 
 
 def test_a_cell_looks_at_the_middle_of_its_window() -> None:
@@ -144,3 +161,14 @@ def test_a_sighting_is_found_from_a_quality_of_a_half_on_where_the_patch_lies_or
         for quality, found in ((0.5, True), (0.49, False)):
             seen = _as_detection(Sighting(view, fit, 0.5, (1.0, 2.0), quality, (30.0, 40.0)))
             assert (seen.found, seen.quality, seen.center_px) == (found, quality, center)
+
+
+def test_what_is_alike_both_ways_round_lies_as_well_the_other_way_wherever_it_was_shown() -> None:
+    shown = lay(toy(front=False), table(), (320.0, 255.0))  # not in the middle of its patch
+    appearance = Appearance.of(cut_patch(shown, CENTER))
+    scene = pyramid_of(lay(toy(front=False), table(1), (300.0, 200.0), 40.0))
+    (fits,) = coarse_fits(appearance.template, scene, [(300.0, 200.0)])
+    fit = middle_fit(appearance.template, scene, max(fits, key=lambda one: one.score))
+    other = _opposite(appearance, scene, fit)
+    assert math.cos(other.turn_rad - fit.turn_rad) < -0.95
+    assert other.score == pytest.approx(fit.score, abs=0.05)

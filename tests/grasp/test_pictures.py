@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from qsgm.grasp.heatmap import Detection
-from qsgm.grasp.pictures import _values, draw_detection, draw_objects
+from qsgm.grasp.pictures import _shortened, _text_width, _values, draw_detection, draw_objects
 
 FRAME = np.full((480, 640, 3), 128, dtype=np.uint8)
 NOTHING = np.zeros((3, 23, 33), dtype=np.float32)
@@ -139,6 +139,15 @@ def test_a_names_dark_rim_lies_around_its_letters(enlarged: bool) -> None:
     assert 0 <= changed[-1] - ink[-1] <= 6
 
 
+def test_of_a_long_title_as_much_is_left_as_has_room() -> None:
+    title = "a name that never ends " * 20
+    for room in (100, 500):
+        shown = _shortened(title, room, 1.0)
+        assert title.startswith(shown.removesuffix("..."))
+        assert room - 40 < _text_width(shown, 1.0, bold=False) <= room
+    assert _shortened("mug", 500, 1.0) == "mug"
+
+
 def test_the_bar_is_filled_as_far_as_the_quality_goes() -> None:
     for quality, share in ((0.0, 0.0), (0.25, 0.25), (0.9, 0.9), (1.0, 1.0), (1.5, 1.0)):
         picture = draw_detection(FRAME, NOTHING, replace(detection(), quality=quality), "mug")
@@ -213,6 +222,7 @@ def test_the_caption_says_what_was_found_in_words_and_numbers() -> None:
         "turn (counter-clockwise)": "-30.0 deg",
         "quality": "0.90",
     }
+    assert dict(_values(detection(angle_deg=-0.04)))["turn (counter-clockwise)"] == "+0.0 deg"
     same = draw_detection(FRAME, NOTHING, turned, "mug")
     other = draw_detection(FRAME, NOTHING, turned, "cup")
     changed = (same != other).any(axis=2)

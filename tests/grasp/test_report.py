@@ -43,6 +43,7 @@ def test_a_find_is_told_by_name_quality_centre_way_and_turn() -> None:
         ["move", "-112.3", "px", "right,", "+60.7", "px", "down"],
         ["turn", "-60.2°", "counter-clockwise,", "or", "the", "opposite"],
     ]
+    assert detection_table(FOUND, "mug").columns[0].style == "bold"
     known = detection_table(replace(FOUND, full_angle_deg=119.76), "mug")
     assert rows(known)[-1] == ["turn", "+119.8°", "counter-clockwise"]
 

@@ -116,6 +116,18 @@ def test_what_is_no_stream_is_refused_in_one_line(
     assert capfd.readouterr().err == ""
 
 
+def test_a_number_is_a_camera_unless_there_is_something_of_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("7").mkdir()
+    write_png(Path("7/0.png"), both_on_a_table())
+    assert len(list(watch("7", []))) == 1
+    for camera in ("98", 7):
+        with pytest.raises(QsgmError, match=f"cannot open camera {camera}:"):
+            open_stream(camera)
+
+
 def test_a_video_that_is_cut_off_ends_where_it_ends(
     belt: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
