@@ -6,9 +6,8 @@ is unlike anybody drawn: rates count only where at twice as high ones no run end
 began.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import TypeAlias
 
 from qsgm.manifest import OptimizerName, Recipe
@@ -28,7 +27,9 @@ from qsgm.train.pretraining.tasks import TaskSet, start_states
 
 LENGTHS = (1, 3, 20)  # epochs
 # What a shape of rates is multiplied with, each twice the one before: the margin is one further.
+# Where the first is too much already, halves of it down to the least.
 SCALES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+LEAST = 2.0**-10
 SGD_LAST, ADAM_LAST = 0.1, 0.016  # of the last layer, at scale 1
 # Of a layer's rate, what the one in front of it has.
 SHARES = (0.03, 0.1, 0.3, 1.0)
@@ -145,7 +146,15 @@ def _of_shape(
     """The best scale of one shape at each length."""
     scales, scores = list[float](), list[Score]()
     for epochs in LENGTHS:
-        tried = dict(_tried(rule, shape[1], start, tasks, bounds, epochs))
+
+        def run(scale: float, epochs: int = epochs) -> tuple[Score, bool]:
+            """What comes of a scale, and whether no run made a task worse."""
+            trial = replace(rule, rates=tuple(scale * rate for rate in shape[1]))
+            each = run_each(trial, start, tasks, epochs, chunk=len(tasks))
+            pairs = zip(each, bounds, strict=True)
+            return mean_score(each), all(one.objective <= bound for one, bound in pairs)
+
+        tried = sound_scales(run)
         (scale,) = best_rates({(one,): result for one, result in tried.items()})
         scales.append(scale)
         scores.append(tried[scale])
@@ -153,27 +162,23 @@ def _of_shape(
     return Chosen(shape, tuple(scales), tuple(scores))
 
 
-def _tried(
-    rule: UpdateRule,
-    rates: Rates,
-    start: Start,
-    tasks: TaskSet,
-    bounds: Sequence[float],
-    epochs: int,
-) -> Iterator[tuple[float, Score]]:
-    """Scales at whose double no run makes a task worse, and at least the lowest, with scores."""
-    before: tuple[float, Score] | None = None
-    for scale in SCALES:
-        trial = replace(rule, rates=tuple(scale * rate for rate in rates))
-        each = run_each(trial, start, tasks, epochs, chunk=len(tasks))
-        sound = all(
-            isfinite(one.objective) and one.objective <= bound
-            for one, bound in zip(each, bounds, strict=True)
-        )
-        if before is None and not sound:
-            yield scale, mean_score(each)
-        elif before is not None and sound:
-            yield before
+def sound_scales(run: Callable[[float], tuple[Score, bool]]) -> dict[float, Score]:
+    """Scales at whose double a run is sound, too, the lowest first, and what comes of them.
+
+    `run` gives a scale's score, and whether it is sound. There is always one: where none has that
+    margin, the lowest.
+    """
+    scale, found = SCALES[0], dict[float, Score]()
+    result, sound = run(scale)
+    while not sound and scale > LEAST:
+        scale /= 2
+        result, sound = run(scale)
+    if scale < SCALES[0]:
+        return {scale / 2: run(scale / 2)[0]}
+    for double in SCALES[1:]:
+        next_result, sound = run(double)
         if not sound:
-            return
-        before = scale, mean_score(each)
+            break
+        found[scale] = result
+        scale, result = double, next_result
+    return found or {scale: result}
