@@ -399,7 +399,7 @@ def test_an_array_of_samples_is_pretrained_on_as_a_json_file_says(
     task, seen = digits(), list[Any]()
     about = {"network": task.network.to_json(), "heads": heads_to_json(task.heads)}
     (tmp_path / "pool.json").write_text(json.dumps(about | {"samples": "pool.npz"}))
-    made = SimpleNamespace(card={"config": {"first_rates": [0.1]}}, rates={"4": (0.2,)})
+    made = SimpleNamespace(card={"config": {"first_rates": [0.1]}}, rates={"4": (0.2,)}, recipes={})
     monkeypatch.setattr(building, "pretrain_samples", lambda *given: seen.append(given) or made)
     arguments = ["pretrain", "--task", str(tmp_path / "pool.json"), "--hidden", "8", "--json"]
     assert cli.run([*arguments, "-o", str(tmp_path / "mine.pt")]) == 0

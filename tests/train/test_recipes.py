@@ -17,7 +17,7 @@ from qsgm.train.pretraining import recipes as module
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, fine_tune, run_each, score
 from qsgm.train.pretraining.map_sgms import behind
 from qsgm.train.pretraining.rates import Start
-from qsgm.train.pretraining.recipes import WORSE, choose_recipes, late_runs
+from qsgm.train.pretraining.recipes import choose_recipes, late_runs
 from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, start_states
 
 TASK = ToyTask()
@@ -76,21 +76,19 @@ def test_every_number_of_layers_has_both_optimizers_and_a_gain_for_every_length(
 
 
 @pytest.mark.parametrize("factor", [1, 30])
-def test_at_twice_the_rates_no_run_ends_much_worse_than_it_began(
-    start: Start, tasks: TaskSet, factor: int
-) -> None:
+def test_at_twice_the_rates_no_run_is_lost(start: Start, tasks: TaskSet, factor: int) -> None:
     louder = replace(tasks, features=factor * tasks.features)
     found, _ = choose_recipes(rule(), start, louder, lambda _: None)
     for tuned, recipes in found.items():
         seen = behind(TASK.network, start[: 2 - tuned], louder, 3)
         before = [one.objective for one in score(start_states(start[2 - tuned :], 3), seen, TASK)]
+        bounds = [was + sum(before) / 3 for was in before]
         for one in recipes:
             for epochs, (steps, _) in zip((1, 4), one.gains, strict=True):
                 double = tuple(2 * rate for rate in one.rates_over(steps))
                 trial = replace(rule(), rates=double, optimizer=one.optimizer)
                 after = run_each(trial, start[2 - tuned :], seen, epochs)
-                pairs = zip(before, after, strict=True)
-                assert all(now.objective <= WORSE * was for was, now in pairs)
+                assert all(a.objective <= bound for a, bound in zip(after, bounds, strict=True))
 
 
 def test_the_louder_the_features_the_lower_the_rates(start: Start, tasks: TaskSet) -> None:

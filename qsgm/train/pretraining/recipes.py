@@ -2,8 +2,8 @@
 
 Where rates start is tried out on runs as the device does them: on lessons of their own, at every
 length that a user is likely to ask for, with the same decay, by SGD and by Adam. A device meets who
-is unlike anybody drawn: rates count only where at twice as high ones no run ends worse than it
-began.
+is unlike anybody drawn, of whom the network knows nearly everything: of rates that do about as well
+the highest are taken, among those at whose double no run is lost.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 from qsgm.manifest import OptimizerName, Recipe
 from qsgm.schedule import BATCH
+from qsgm.task import Task
 from qsgm.train.model.curvature import FLAT
 from qsgm.train.pretraining.evaluate import (
     Score,
@@ -33,8 +34,8 @@ LEAST = 2.0**-10
 SGD_LAST, ADAM_LAST = 0.1, 0.016  # of the last layer, at scale 1
 # Of a layer's rate, what the one in front of it has.
 SHARES = (0.03, 0.1, 0.3, 1.0)
-# A run whose held-out loss is more than this of the untouched network's made it worse.
-WORSE = 1.1
+# Times the lowest held-out objective of all scales: about as well.
+AS_WELL = 1.05
 # Adam keeps twice as much; it has to be worth that.
 WORTH = 0.98
 
@@ -122,8 +123,7 @@ def _by_optimizer(
     rule: UpdateRule, start: Start, tasks: TaskSet, learnt: Rates, after_run: AfterRun
 ) -> dict[OptimizerName, Chosen]:
     """The best shape of each optimizer."""
-    untouched = score(start_states(start, len(tasks)), tasks, rule.task)
-    bounds, best = [WORSE * one.objective for one in untouched], dict[OptimizerName, Chosen]()
+    bounds, best = lost_beyond(start, tasks, rule.task), dict[OptimizerName, Chosen]()
     for shape in shapes(len(start), learnt):
         name, _ = shape
         trial = replace(
@@ -133,6 +133,17 @@ def _by_optimizer(
         if name not in best or chosen.objective < best[name].objective:
             best[name] = chosen
     return best
+
+
+def lost_beyond(start: Start, tasks: TaskSet, task: Task) -> list[float]:
+    """By task, the held-out objective beyond which a run is lost.
+
+    It made things worse by more than what the untouched network is off on the average: one whose
+    network was nearly right may lose a little, of which there is enough by chance.
+    """
+    before = score(start_states(start, len(tasks)), tasks, task)
+    typical = mean_score(before).objective
+    return [one.objective + typical for one in before]
 
 
 def _of_shape(
@@ -148,18 +159,29 @@ def _of_shape(
     for epochs in LENGTHS:
 
         def run(scale: float, epochs: int = epochs) -> tuple[Score, bool]:
-            """What comes of a scale, and whether no run made a task worse."""
+            """What comes of a scale, and whether no run is lost."""
             trial = replace(rule, rates=tuple(scale * rate for rate in shape[1]))
             each = run_each(trial, start, tasks, epochs, chunk=len(tasks))
             pairs = zip(each, bounds, strict=True)
             return mean_score(each), all(one.objective <= bound for one, bound in pairs)
 
         tried = sound_scales(run)
-        (scale,) = best_rates({(one,): result for one, result in tried.items()})
+        scale = highest(tried)
         scales.append(scale)
         scores.append(tried[scale])
         after_run(tried[scale])
     return Chosen(shape, tuple(scales), tuple(scores))
+
+
+def highest(tried: Mapping[float, Score]) -> float:
+    """Of scales, the lowest first, the highest that does about as well as the best.
+
+    Raises:
+        QsgmError: there is none that is finite.
+    """
+    (best,) = best_rates({(scale,): result for scale, result in tried.items()})
+    bound = AS_WELL * tried[best].objective
+    return max(scale for scale, result in tried.items() if result.objective <= bound)
 
 
 def sound_scales(run: Callable[[float], tuple[Score, bool]]) -> dict[float, Score]:
