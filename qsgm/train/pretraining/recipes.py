@@ -187,20 +187,18 @@ def highest(tried: Mapping[float, Score]) -> float:
 def sound_scales(run: Callable[[float], tuple[Score, bool]]) -> dict[float, Score]:
     """Scales at whose double a run is sound, too, the lowest first, and what comes of them.
 
-    `run` gives a scale's score, and whether it is sound. There is always one: where none has that
-    margin, the lowest.
+    `run` gives a scale's score, and whether it is sound. There is always a scale: where none of
+    those to be tried is, the first lower one.
     """
     scale, found = SCALES[0], dict[float, Score]()
     result, sound = run(scale)
     while not sound and scale > LEAST:
         scale /= 2
         result, sound = run(scale)
-    if scale < SCALES[0]:
-        return {scale / 2: run(scale / 2)[0]}
-    for double in SCALES[1:]:
-        next_result, sound = run(double)
+    for double in SCALES[1:] if scale == SCALES[0] else ():
+        following, sound = run(double)
         if not sound:
             break
         found[scale] = result
-        scale, result = double, next_result
-    return found or {scale: result}
+        scale, result = double, following
+    return found or {scale / 2: run(scale / 2)[0]}
