@@ -103,18 +103,16 @@ class Bundle:
         Without `blocks` for those of :func:`qsgm.manifest.default_blocks`.
         """
         recipes = self.manifest.recipes[method]
-        name = optimizer or recipes.optimizer
         text = str(blocks or default_blocks(method, layers))
-        rates = recipes.rates.get(name, {})
-        if text not in rates:
-            other = recipes.optimizer
+        name = optimizer or recipes.usual(text)
+        if text not in recipes.rates.get(name, {}):
+            other = recipes.usual(text)
             advice = f"--optimizer {other}" if name != other else "another --bundle"
             raise QsgmError(
                 f"the bundle {self.folder} has no rates for {name} on the blocks {text}; pass "
                 f"{advice}"
             )
-        gain = recipes.short_gains.get(text, 1.0) if name == "sgd" else 1.0
-        return Recipe(name, rates[text], gain)
+        return recipes.recipe(name, text)
 
     def session(
         self, name: str, threads: int = 1, constants: Mapping[str, NDArray[Any]] | None = None

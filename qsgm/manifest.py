@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, get_args
@@ -16,7 +17,7 @@ from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import is_plain, read_file
 from qsgm.network import Network
-from qsgm.schedule import short_run_factor
+from qsgm.schedule import Gains, gain_over, short_run
 from qsgm.sgm.int8 import ACTIVATION_BITS, ActivationBits
 from qsgm.task import Heads, TaskRecord, heads_from_json, heads_to_json, output_count
 
@@ -84,11 +85,11 @@ class Recipe:
 
     optimizer: OptimizerName
     rates: tuple[float, ...]  # one per tuned layer, first layer first
-    short_gain: float = 1.0  # what short runs multiply them with
+    gains: Gains = ()  # what runs of some lengths multiply them with
 
     def rates_over(self, steps: int) -> tuple[float, ...]:
         """Where the rates of a run of so many steps start."""
-        factor = short_run_factor(self.short_gain, steps)
+        factor = gain_over(self.gains, steps)
         return tuple(factor * rate for rate in self.rates)
 
 
@@ -98,7 +99,32 @@ class Recipes:
 
     optimizer: OptimizerName
     rates: Mapping[OptimizerName, Mapping[str, tuple[float, ...]]]
-    short_gains: Mapping[str, float] = field(default_factory=dict)  # by blocks; 1 where none is
+    short_gains: Mapping[str, float] = field(default_factory=dict)  # of SGD by blocks; 1 where none
+    # By optimizer and blocks, what runs of known lengths take, in the place of `short_gains`.
+    gains: Mapping[OptimizerName, Mapping[str, Gains]] = field(default_factory=dict)
+    optimizers: Mapping[str, OptimizerName] = field(default_factory=dict)  # usual for some blocks
+
+    def usual(self, blocks: str) -> OptimizerName:
+        """The optimizer of these blocks unless the user says otherwise."""
+        return self.optimizers.get(blocks, self.optimizer)
+
+    def recipe(self, name: OptimizerName, blocks: str) -> Recipe:
+        """Rates and gains of these blocks with an optimizer. Raises LookupError without any."""
+        rates, gains = self.rates[name][blocks], self.gains.get(name, {}).get(blocks)
+        gain = self.short_gains.get(blocks, 1.0) if name == "sgd" else 1.0
+        usual = short_run(gain) if gain != 1 else ()
+        return Recipe(name, rates, usual if gains is None else gains)
+
+    def only(self, blocks: str) -> "Recipes":
+        """What these blocks take by their usual optimizer, and no more."""
+        name = self.usual(blocks)
+        gains = self.gains.get(name, {})
+        return Recipes(
+            name,
+            {name: {blocks: self.rates[name][blocks]}},
+            {blocks: self.short_gains[blocks]} if blocks in self.short_gains else {},
+            {name: {blocks: gains[blocks]}} if blocks in gains else {},
+        )
 
 
 @dataclass(frozen=True)
@@ -205,7 +231,7 @@ def manifest_from(values: Mapping[str, Any], path: Path) -> Manifest:
         lambda found: _sgms_from(found, network, heads, layers, size_of(path, WEIGHTS)),
     )
     files = read.part("files", "a sha256 for every file by its plain name", _files_from)
-    missing = sorted(needed_files(network, trunk, recipes["sgm"].optimizer, blocks) - files.keys())
+    missing = sorted(needed_files(network, trunk, recipes["sgm"], blocks) - files.keys())
     if missing:
         raise QsgmError(f"{path}: 'files' does not list {missing[0]}; run `{COMMAND}` again")
     usual = dict[int, str]()
@@ -220,13 +246,13 @@ def manifest_from(values: Mapping[str, Any], path: Path) -> Manifest:
 
 
 def needed_files(
-    network: Network, trunk: Precision, optimizer: OptimizerName, blocks: Sequence[str]
+    network: Network, trunk: Precision, recipes: Recipes, blocks: Sequence[str]
 ) -> set[str]:
     """The graphs without which a bundle cannot tune all of its blocks as is usual."""
     needed = {NETWORK, WEIGHTS}
     for one in (parse_blocks(text, network.depth) for text in blocks):
         needed |= {head_file(len(one.layers)), trunk_file(trunk, one.layers)}
-        needed.add(step_file(defaults.PRECISION, optimizer, one))
+        needed.add(step_file(defaults.PRECISION, recipes.usual(str(one)), one))
     return needed
 
 
@@ -368,8 +394,36 @@ def _method_from(values: Any, can_tune: Sequence[str]) -> Recipes:
         for text, one in by_blocks.items():
             _require(one, len(one) == len(parse_blocks(text).layers))
     _require(rates, all(text in rates[optimizer] for text in can_tune))
-    gains = {text: _positive(gain) for text, gain in values.get("short_gains", {}).items()}
-    return Recipes(optimizer, rates, gains)
+    short = {text: _positive(gain) for text, gain in values.get("short_gains", {}).items()}
+    gains = {
+        _require(name, name in rates): {
+            _require(text, text in rates[name]): _gains_from(one) for text, one in by_blocks.items()
+        }
+        for name, by_blocks in values.get("gains", {}).items()
+    }
+    usual = {
+        text: _require(name, text in rates[name])
+        for text, name in values.get("optimizers", {}).items()
+    }
+    return Recipes(optimizer, rates, short, gains, usual)
+
+
+def recipe_from(values: Any) -> Recipe:
+    """A recipe from its fields as plain values.
+
+    Raises:
+        LookupError, TypeError, ValueError or OverflowError: they are no recipe's.
+    """
+    name = _require(values["optimizer"], values["optimizer"] in OPTIMIZERS)
+    gains = _gains_from(values["gains"]) if values["gains"] else ()
+    return Recipe(name, tuple(map(_positive, values["rates"])), gains)
+
+
+def _gains_from(values: Any) -> Gains:
+    """Lengths in steps, each longer than the one before, with a factor each."""
+    found = tuple((_require(steps, type(steps) is int), _positive(gain)) for steps, gain in values)
+    lengths = [0, *(steps for steps, _ in found)]
+    return _require(found, bool(found) and all(a < b for a, b in pairwise(lengths)))
 
 
 def _initializers_from(
@@ -452,8 +506,17 @@ def _recipes_json(recipes: Recipes) -> dict[str, Any]:
         name: {text: list(one) for text, one in by_blocks.items()}
         for name, by_blocks in recipes.rates.items()
     }
-    gains = {"short_gains": dict(recipes.short_gains)} if recipes.short_gains else {}
-    return {"optimizer": recipes.optimizer, "rates": rates, **gains}
+    gains = {
+        name: {text: [[*pair] for pair in one] for text, one in by_blocks.items()}
+        for name, by_blocks in recipes.gains.items()
+    }
+    more = {
+        "short_gains": dict(recipes.short_gains),
+        "gains": gains,
+        "optimizers": dict(recipes.optimizers),
+    }
+    said = {key: value for key, value in more.items() if value}
+    return {"optimizer": recipes.optimizer, "rates": rates, **said}
 
 
 def _file_json(file: FileEntry) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What meta-training and the device must share: batches, momentum, how rates change over a run."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from math import log
 
 import numpy as np
@@ -10,15 +11,35 @@ BATCH = 32
 MOMENTUM = 0.9  # of SGD
 SHORT_RUN_STEPS, LONG_RUN_STEPS = 75, 500  # 3 and 20 epochs over 800 samples
 
+# (steps, factor): what runs of some lengths multiply their learning rates with, the shortest first.
+Gains = tuple[tuple[int, float], ...]
+
+
+def short_run(gain: float) -> Gains:
+    """Gains of a task whose lengths nobody says: `gain` up to 75 steps, 1 from 500 on."""
+    return ((SHORT_RUN_STEPS, gain), (LONG_RUN_STEPS, 1.0))
+
+
+def gain_over(gains: Gains, steps: int) -> float:
+    """Factor on the learning rates of a run of this length, geometric between known lengths.
+
+    A short run has to take large steps, and is over before these could lead it astray. A run that
+    is shorter or longer than all known ones takes what the nearest of them does.
+    """
+    if not gains:
+        return 1.0
+    if steps <= gains[0][0]:
+        return gains[0][1]
+    for (short, first), (long, second) in pairwise(gains):
+        if steps <= long:
+            shortness = log(long / steps) / log(long / short)
+            return float(second * (first / second) ** shortness)
+    return gains[-1][1]
+
 
 def short_run_factor(gain: float, steps: int) -> float:
-    """Factor on the learning rates of a run of this length.
-
-    `gain` up to 75 steps, 1 from 500 on, geometric between: a short run has to take large steps,
-    and is over before these could lead it astray.
-    """
-    shortness = log(LONG_RUN_STEPS / max(1, steps)) / log(LONG_RUN_STEPS / SHORT_RUN_STEPS)
-    return float(gain ** min(1.0, max(0.0, shortness)))
+    """:func:`gain_over` of :func:`short_run`."""
+    return gain_over(short_run(gain), steps)
 
 
 def rate_factor(step: int, steps: int) -> float:

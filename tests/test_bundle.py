@@ -282,6 +282,15 @@ def set_in(manifest: dict[str, Any], *keys_and_value: Any) -> None:
         (("recipes", "sgm", "short_gains", "6"), "1.5", "'recipes' is damaged"),
         (("recipes", "sgm", "short_gains", "6"), 10**400, "'recipes' is damaged"),
         (("recipes", "sgm", "rates", "adam", "6"), ["fast"], "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"6": []}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"6": [[5, 0.0]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"6": [[5.0, 1.0]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"6": [[0, 1.0]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"6": [[9, 2], [9, 1]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"adam": {"5-6": [[9, 1]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "gains"), {"lion": {"6": [[9, 1]]}}, "'recipes' is damaged"),
+        (("recipes", "sgm", "optimizers"), {"6": "lion"}, "'recipes' is damaged"),
+        (("recipes", "sgm", "optimizers"), {"4,5-6": "adam"}, "'recipes' is damaged"),
         (("recipes", "bp", "rates", "adam", "5-6"), [1e-3, float("inf")], "'recipes' is damaged"),
         (("initializers", "bias6"), None, "'initializers' is damaged"),
         (("initializers", "bias6", "shape"), [3, 1], "'initializers' is damaged"),
@@ -378,3 +387,24 @@ def test_short_runs_of_sgms_start_at_higher_rates_and_those_of_others_do_not(
         assert recipe.rates_over(steps) == pytest.approx(expected, rel=1e-2)
     for other in (found.recipe("sgm", LAST_TWO, "adam"), found.recipe("bp", LAST_TWO, "sgd")):
         assert other.rates_over(25) == other.rates
+
+
+def test_gains_by_length_take_the_place_of_those_of_short_runs(own_bundle: Path) -> None:
+    path = own_bundle / "manifest.json"
+    manifest = json.loads(path.read_text())
+    recipes = manifest["recipes"]["sgm"]
+    recipes["short_gains"]["5,6"] = 4.0
+    recipes["gains"] = {"adam": {"5,6": [[5, 8.0], [20, 2.0], [80, 0.5]]}}
+    recipes["optimizers"] = {"5,6": "adam"}
+    path.write_text(json.dumps(manifest))
+    found = load_bundle(own_bundle)
+    recipe = found.recipe("sgm", LAST_TWO, None)
+    assert recipe.optimizer == "adam"
+    # Geometric between known lengths, as far as those go: 10 lies half way from 5 to 20.
+    for steps, factor in ((1, 8), (5, 8), (10, 4), (20, 2), (40, 1), (80, 0.5), (9000, 0.5)):
+        expected = [factor * rate for rate in recipe.rates]
+        assert recipe.rates_over(steps) == pytest.approx(expected, rel=1e-6)
+    plain = found.recipe("sgm", LAST_TWO, "sgd")
+    assert plain.rates_over(5) == pytest.approx([4 * rate for rate in plain.rates])
+    assert found.recipe("sgm", found.network.last(1), None).optimizer == "sgd"
+    assert found.manifest.to_json()["recipes"]["sgm"]["gains"] == recipes["gains"]

@@ -51,7 +51,9 @@ def read_and_tune(
         state[f"weight{k}"] = weight.transpose(0, 2, 3, 1).reshape(len(weight), -1)
         state[f"bias{k}"] = place(network, manifest["initializers"][f"bias{k}"])
     recipe = manifest["recipes"]["sgm"]
-    optimizer, steps = recipe["optimizer"], epochs * math.ceil(taught / 32)
+    optimizer = recipe.get("optimizers", {}).get(blocks, recipe["optimizer"])
+    steps = epochs * math.ceil(taught / 32)
+    assert blocks not in recipe.get("gains", {}).get(optimizer, {})
     shortness = math.log(500 / steps) / math.log(500 / 75)
     gain = recipe["short_gains"][blocks] ** min(1.0, max(0.0, shortness))
     step = session(folder, f"step_{precision}_{optimizer}_{blocks}.onnx", manifest)

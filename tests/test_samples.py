@@ -22,7 +22,7 @@ from qsgm import (
     load_task,
 )
 from qsgm.samples.arrays import NAME, ArraysTask, read_npz
-from qsgm.samples.lesson import head_scores, lesson_of
+from qsgm.samples.lesson import fallen, head_scores, lesson_of
 from qsgm.samples.taskfile import read_samples, task_for
 from qsgm.task import TaskRecord, task_record
 
@@ -277,3 +277,17 @@ def labels(numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 def test_a_single_number_in_an_archive_stays_one(tmp_path: Path) -> None:
     found = read_npz(saved(tmp_path / "a.npz", arm=1, kinds=np.arange(3)), ("arm", "kinds"))
     assert (found["arm"].shape, int(found["arm"]), found["kinds"].shape) == ((), 1, (3,))
+
+
+def test_what_got_worse_is_said_by_head() -> None:
+    heads = (*HEADS, Head("size", "squared", 1, "sigmoid"), Head("on", "log_loss", 1, "sigmoid"))
+    before = {"kind_accuracy": 0.9, "size_error": 0.1, "on_accuracy": 0.5, "mine": 1.0}
+    assert fallen(heads, before, before) == ()
+    assert fallen(heads, before, {"kind_accuracy": 1.0, "size_error": 0.05, "mine": 0.0}) == ()
+    after = {"kind_accuracy": 0.4, "size_error": 0.2, "on_accuracy": None}
+    kind, size = fallen(heads, before, after)
+    assert "kind_accuracy 0.900 before, 0.400 now" in kind
+    assert "size_error 0.100 before, 0.200 now" in size
+    for line in (kind, size, *fallen(heads, before, {"kind_accuracy": float("nan")})):
+        assert "got worse" in line or "made it worse" in line
+    assert len(fallen(heads, before, {"kind_accuracy": float("nan")})) == 1

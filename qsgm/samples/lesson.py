@@ -119,6 +119,21 @@ def head_scores(heads: Sequence[Head], outputs: Array, labels: Array) -> Scores:
     return found
 
 
+def fallen(heads: Sequence[Head], before: Scores, after: Scores) -> tuple[str, ...]:
+    """A line for every head's score of :func:`head_scores` that got worse."""
+    lines = list[str]()
+    for head in heads:
+        error = head.kind == "squared"
+        name = f"{head.name}_{'error' if error else 'accuracy'}"
+        was, now = before.get(name), after.get(name)
+        if was is not None and now is not None and not (now <= was if error else now >= was):
+            lines.append(
+                f"tuning made it worse: held-out {name} {was:.3f} before, {now:.3f} now; show more "
+                "samples, or other --epochs or --layers, or keep the untouched network"
+            )
+    return tuple(lines)
+
+
 def _worth(head: Head, answers: Array, known: Array) -> float:
     if head.kind == "cross_entropy":
         return float(np.mean(answers.argmax(axis=1) == known.argmax(axis=1)))

@@ -16,7 +16,7 @@ import onnxruntime as ort
 from qsgm import __version__
 from qsgm.bundle import Bundle
 from qsgm.progress import Progress
-from qsgm.samples.lesson import Samples, checked_samples
+from qsgm.samples.lesson import Samples, checked_samples, fallen
 from qsgm.samples.report import run_json
 from qsgm.samples.task import SampleTask
 from qsgm.samples.taskfile import task_of_bundle
@@ -87,6 +87,8 @@ def learn(
     plan = resolve(settings or usual_settings(bundle, task), bundle)
     lesson = task.lesson(checked, np.random.default_rng(plan.settings.seed))
     result = tune(prepare(lesson, bundle, plan, watch), plan, watch)
+    worse = fallen(task.heads, result.untouched, result.scores)
+    result = replace(result, warnings=(*result.warnings, *worse))
     return SamplesResult(**{one.name: getattr(result, one.name) for one in fields(result)})
 
 

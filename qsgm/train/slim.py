@@ -125,17 +125,16 @@ def slim_bundle(
 
 def plain_text(manifest: Manifest, blocks: Blocks) -> str:
     """What a slim bundle's manifest says of a run, for readers without JSON: docs/bundle.md."""
-    recipe, layers = manifest.recipes["sgm"], blocks.layers
+    recipes, layers = manifest.recipes["sgm"], blocks.layers
+    recipe = recipes.recipe(recipes.usual(str(blocks)), str(blocks))
     files = {"network": NETWORK, "weights": WEIGHTS, "head": head_file(len(layers))}
     files["trunk"] = trunk_file(manifest.trunk, layers)
     files |= {f"step_{one}": step_file(one, recipe.optimizer, blocks) for one in PRECISIONS}
     files |= {Path(name).stem: name for name in task_names(manifest)}
-    rates = recipe.rates[recipe.optimizer][str(blocks)]
-    gain = recipe.short_gains.get(str(blocks), 1.0) if recipe.optimizer == "sgd" else 1.0
     lines = ["qsgm-bundle-text 1", f"task {manifest.task.name}"]
     lines += [f"{k} {v}" for k, v in manifest.task.settings.items() if isinstance(v, str)]
-    lines += [f"layers {layers[0]} {len(layers)}", f"rates {' '.join(map(str, rates))}"]
-    lines.append(f"short_gain {gain}")
+    lines += [f"layers {layers[0]} {len(layers)}", f"rates {' '.join(map(str, recipe.rates))}"]
+    lines += pace_lines(recipes, str(blocks))
     for k in layers:
         weight, bias = (manifest.initializers[f"{kind}{k}"] for kind in ("weight", "bias"))
         lines.append(f"layer{k} {' '.join(map(str, weight.shape))} {weight.offset} {bias.offset}")
@@ -143,12 +142,24 @@ def plain_text(manifest: Manifest, blocks: Blocks) -> str:
     return "\n".join(lines) + "\n"
 
 
+def pace_lines(recipes: Recipes, blocks: str) -> list[str]:
+    """The gain of short runs; gains by length and the optimizer, where they are unusual."""
+    name = recipes.usual(blocks)
+    short = recipes.short_gains.get(blocks, 1.0) if name == "sgd" else 1.0
+    known = recipes.gains.get(name, {}).get(blocks, ())
+    lines = [f"short_gain {short}"]
+    if known:
+        lines.append("gains " + " ".join(f"{steps} {factor}" for steps, factor in known))
+    return lines if name == "sgd" else [*lines, f"optimizer {name}"]
+
+
 def kept_graphs(bundle: Bundle, blocks: Blocks) -> list[str]:
     """Names of the graphs that tuning these blocks opens; a bundle may do without the probe."""
     layers, recipes = blocks.layers, bundle.manifest.recipes
-    steps = [step_file(one, recipes["sgm"].optimizer, blocks) for one in PRECISIONS]
+    steps = [step_file(one, recipes["sgm"].usual(str(blocks)), blocks) for one in PRECISIONS]
     names = [head_file(len(layers)), trunk_file(bundle.manifest.trunk, layers), *steps]
-    names.append(step_file("float", recipes["bp"].optimizer, one_block(layers)))
+    whole = one_block(layers)
+    names.append(step_file("float", recipes["bp"].usual(str(whole)), whole))
     if bundle.has(probe_file(len(layers))):
         names.append(probe_file(len(layers)))
     return list(dict.fromkeys(names))
@@ -170,19 +181,12 @@ def kept_entry(bundle: Bundle, name: str, data: bytes) -> FileEntry:
     return FileEntry(hashlib.sha256(data).hexdigest(), bundle.peak_activation_bytes(name))
 
 
-def kept_recipes(recipes: Recipes, text: str) -> Recipes:
-    """Its own optimizer's rates of these blocks."""
-    name = recipes.optimizer
-    gains = {text: recipes.short_gains[text]} if text in recipes.short_gains else {}
-    return Recipes(name, {name: {text: recipes.rates[name][text]}}, gains)
-
-
 def kept_manifest(manifest: Manifest, blocks: Blocks) -> Manifest:
     """The bundle's own, of these blocks only."""
     names = [f"{kind}{k}" for k in blocks.layers for kind in ("weight", "bias")]
     kept: dict[Method, Recipes] = {
-        "sgm": kept_recipes(manifest.recipes["sgm"], str(blocks)),
-        "bp": kept_recipes(manifest.recipes["bp"], str(one_block(blocks.layers))),
+        "sgm": manifest.recipes["sgm"].only(str(blocks)),
+        "bp": manifest.recipes["bp"].only(str(one_block(blocks.layers))),
     }
     return replace(
         manifest,

@@ -104,10 +104,10 @@ def peak_activation_bytes(
     Reckoned from the graphs when they were exported: weights, states, inputs and outputs do not
     count. None: the bundle does not say.
     """
-    recipes = bundle.manifest.recipes
+    recipes, whole = bundle.manifest.recipes, one_block(blocks.layers)
     names = {
-        "sgm": step_file(precision, recipes["sgm"].optimizer, blocks),
-        "backprop": step_file("float", recipes["bp"].optimizer, one_block(blocks.layers)),
+        "sgm": step_file(precision, recipes["sgm"].usual(str(blocks)), blocks),
+        "backprop": step_file("float", recipes["bp"].usual(str(whole)), whole),
     }
     return {method: bundle.peak_activation_bytes(name) for method, name in names.items()}
 
