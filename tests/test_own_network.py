@@ -204,11 +204,13 @@ def test_a_device_tunes_layers_in_the_groups_that_pay_unless_told_otherwise(
     for tuned, text in usual.items():
         plan = resolve(Settings(layers=tuned), bundle)
         assert str(plan.blocks) == text
-        assert plan.recipe.rates == rates[text]
+        assert resolve(Settings(layers=tuned, optimizer="sgd"), bundle).recipe.rates == rates[text]
         early = {*rates[text][:-2]}
         assert len(early) == (tuned > 2)  # one for all that were not meta-trained
         assert early <= {*EARLY_RATE_GRID}
         assert rates[text][-2:] == rates["3,4"]
+        if tuned > 2:
+            assert plan.recipe.optimizer == "sgd"
     assert str(resolve(Settings(layers=4, optimizer="adam"), bundle).blocks) == "1,2,3,4"
     assert str(resolve(Settings(layers=4, blocks="1,2,3,4"), bundle).blocks) == "1,2,3,4"
     assert str(resolve(Settings(layers=4, method="bp"), bundle).blocks) == "1-4"
@@ -222,6 +224,79 @@ def test_a_device_tunes_layers_in_the_groups_that_pay_unless_told_otherwise(
         whole[key] for key in ("blocks", "scores", "rates")
     ]
     assert "blocks 1,2-3,4" in run(capsys, "finetune", "--bundle", tmp_path / "s", *told)
+
+
+def with_usual(bundle: Path, folder: Path, optimizer: str) -> Path:
+    """The bundle with another usual optimizer for two layers."""
+    copied = Path(shutil.copytree(bundle, folder))
+    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest["recipes"]["sgm"]["optimizers"] = {"3,4": optimizer}
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    return copied
+
+
+def test_rates_were_tried_out_at_the_lengths_of_a_devices_runs(made: Path) -> None:
+    bundle, kept = load_bundle(made / "mine"), load_checkpoint(made / "mine.pt")
+    assert [*kept.recipes] == ["4", "3,4"]
+    for text, recipes in kept.recipes.items():
+        layers = bundle.network.last(len(text.split(",")))
+        assert bundle.recipe("sgm", layers, None) == recipes[0]
+        for one in recipes:
+            assert bundle.recipe("sgm", layers, one.optimizer) == one
+            assert [steps for steps, _ in one.gains] == [5, 15, 100]  # of 160 samples
+            assert one.rates_over(100) == pytest.approx(one.rates)
+    sgd = next(one for one in kept.recipes["3,4"] if one.optimizer == "sgd")
+    # More layers than were meta-trained run as long: they take the gains of those that were.
+    deep = resolve(Settings(layers=4), bundle).recipe
+    assert (deep.optimizer, deep.gains) == ("sgd", sgd.gains)
+
+
+@pytest.mark.parametrize("optimizer", ["sgd", "adam"])
+def test_a_slim_bundle_runs_by_the_optimizer_that_is_usual(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], optimizer: str
+) -> None:
+    whole, slim = with_usual(made / "mine", tmp_path / "whole", optimizer), tmp_path / "slim"
+    printed(capsys, "slim", "--bundle", whole, "--blocks", "3,4", "-o", slim)
+    steps = {path.name for path in slim.glob("step_*_3,4.onnx")}
+    assert steps == {f"step_{one}_{optimizer}_3,4.onnx" for one in ("int8", "float")}
+    told = ["--task", FILE, "--int8", "--epochs", 3, "-o", tmp_path / "tuned"]
+    told.append(samples(tmp_path / "hand.npz", 100))
+    reports = [printed(capsys, "finetune", "--bundle", one, *told) for one in (whole, slim)]
+    assert reports[0]["optimizer"] == reports[1]["optimizer"] == optimizer
+    for key in ("scores", "rates", "fidelity"):
+        assert reports[0][key] == reports[1][key]
+    recipe = load_bundle(slim).recipe("sgm", range(3, 5), None)
+    said = (slim / "bundle.txt").read_text().splitlines()
+    pairs = " ".join(f"{steps} {factor}" for steps, factor in recipe.gains)
+    assert f"gains {pairs}" in said
+    assert (f"optimizer {optimizer}" in said) == (optimizer == "adam")
+    slim_again = tmp_path / "again"
+    printed(capsys, "slim", "--bundle", slim, "--blocks", "3,4", "-o", slim_again)
+    for path in slim.iterdir():
+        assert (slim_again / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_run_that_ends_worse_than_it_began_says_so(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made / "mine" / "manifest.json"
+    bad = Path(shutil.copytree(made / "mine", tmp_path / "bad")) / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["3,4"] = [30.0, 30.0]
+    manifest["recipes"]["sgm"]["optimizers"] = {}
+    bad.write_text(json.dumps(manifest))
+    met = digits().met(np.random.default_rng(5), 250, own_meanings=False)
+    np.savez(tmp_path / "hand.npz", samples=met.inputs, labels=met.labels)
+    told = ["--task", FILE, "--epochs", 3, "-o", tmp_path / "tuned", tmp_path / "hand.npz"]
+    report = printed(capsys, "finetune", "--bundle", bad.parent, *told)
+    before, after = (report[key]["digit_accuracy"] for key in ("zero_shot", "scores"))
+    assert after < before
+    (line,) = report["warnings"]
+    assert f"digit_accuracy {before:.3f} before, {after:.3f} now" in line
+    shown = run(capsys, "finetune", "--bundle", bad.parent, *told)
+    assert "note: tuning made it worse: held-out digit_accuracy" in " ".join(shown.split())
+    nothing = printed(capsys, "finetune", "--bundle", bad.parent, *told, "--epochs", 0)
+    assert nothing["warnings"] == []
 
 
 def test_what_benchmarks_count_is_counted_of_any_network(
@@ -324,7 +399,7 @@ def test_an_array_of_samples_is_pretrained_on_as_a_json_file_says(
     task, seen = digits(), list[Any]()
     about = {"network": task.network.to_json(), "heads": heads_to_json(task.heads)}
     (tmp_path / "pool.json").write_text(json.dumps(about | {"samples": "pool.npz"}))
-    made = SimpleNamespace(card={"config": {"first_rates": [0.1]}}, rates={"4": (0.2,)})
+    made = SimpleNamespace(card={"config": {"first_rates": [0.1]}}, rates={"4": (0.2,)}, recipes={})
     monkeypatch.setattr(building, "pretrain_samples", lambda *given: seen.append(given) or made)
     arguments = ["pretrain", "--task", str(tmp_path / "pool.json"), "--hidden", "8", "--json"]
     assert cli.run([*arguments, "-o", str(tmp_path / "mine.pt")]) == 0

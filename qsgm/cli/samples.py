@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +14,7 @@ from qsgm.files import read_file
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
+    from qsgm.manifest import Recipe
     from qsgm.samples.task import SampleTask
     from qsgm.samples.teach import SamplesResult
     from qsgm.tune.settings import Settings
@@ -42,11 +43,24 @@ def pretrain_task(
     learnt = next(rates for rates in made.rates.values() if len(rates) == len(first))
     if as_json:
         values = {"output": str(output), "seed": seed, "device": device, "task": task.name}
-        print_json(values | {"first_rates": first, "rates": dict(made.rates)})
+        recipes = {text: [asdict(one) for one in some] for text, some in made.recipes.items()}
+        rates = {"first_rates": first, "rates": dict(made.rates), "recipes": recipes}
+        print_json(values | rates)
     else:
         started, ended = (", ".join(f"{rate:.2g}" for rate in some) for some in (first, learnt))
         typer.echo(f"rates of the last {len(first)} layers: from {started} to {ended}")
+        for text, (usual, *_) in made.recipes.items():
+            typer.echo(f"layers {text}: {_paces(usual)}")
         tell("pretrained", output)
+
+
+def _paces(recipe: "Recipe") -> str:
+    """An optimizer, and where its rates start in runs of the lengths that were tried."""
+    paces = [
+        f"{', '.join(f'{rate:.2g}' for rate in recipe.rates_over(steps))} over {steps} steps"
+        for steps, _ in recipe.gains
+    ]
+    return f"{recipe.optimizer}, {'; '.join(paces)}"
 
 
 def export_task(

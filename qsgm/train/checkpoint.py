@@ -4,7 +4,7 @@ import json
 import warnings
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from io import BytesIO
 from math import isfinite
 from pathlib import Path
@@ -15,6 +15,7 @@ import torch
 from qsgm.blocks import parse_blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import read_file, write_bytes_atomic
+from qsgm.manifest import Recipe, recipe_from
 from qsgm.network import Network
 from qsgm.task import TaskRecord, heads_from_json, heads_to_json, output_count
 from qsgm.train.model.curvature import Curvature
@@ -57,6 +58,8 @@ class Checkpoint:
     rates: dict[str, tuple[float, ...]]  # of SGD, by blocks such as `4,5,6`; first layer first
     card: dict[str, Any]  # how it was made, and its figures; plain JSON
     short_gain: float = 1.0  # what short runs of the meta-trained layers multiply rates with
+    # By blocks, where they were tried out at a device's lengths: the usual optimizer's first.
+    recipes: Mapping[str, tuple[Recipe, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         network = self.task.network
@@ -70,6 +73,7 @@ class Checkpoint:
                 raise ValueError(f"there are no rates for layers {singles}")
         if self.short_gain < 1:
             raise ValueError(f"short runs would have their rates lowered, times {self.short_gain}")
+        counts |= {text: len(one.rates) for text, some in self.recipes.items() for one in some}
         for text, count in counts.items():
             layers = len(parse_blocks(text, network.depth).layers)
             if count != layers or layers > self.most_layers:
@@ -98,6 +102,9 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "rates": {blocks: list(rates) for blocks, rates in checkpoint.rates.items()},
         "card": json.dumps(checkpoint.card),
         "short_gain": checkpoint.short_gain,
+        "recipes": json.dumps(
+            {text: [asdict(one) for one in some] for text, some in checkpoint.recipes.items()}
+        ),
     }
     buffer = BytesIO()
     torch.save(data, buffer)
@@ -120,8 +127,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         sgms = {layer: _sgm(layer, task.network, data) for layer in data["sgms"]}
         curvatures = {layer: _curvature(layer, task.network, data) for layer in data["curvatures"]}
         rates, gain = _rates(data["rates"]), _number(data["short_gain"])
-        card = dict(json.loads(data["card"]))
-        checkpoint = Checkpoint(task, net.eval(), sgms, curvatures, rates, card, gain)
+        card, recipes = dict(json.loads(data["card"])), _recipes(data.get("recipes", "{}"))
+        checkpoint = Checkpoint(task, net.eval(), sgms, curvatures, rates, card, gain, recipes)
     except _UNFIT as error:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"
@@ -214,6 +221,13 @@ def _rates(by_blocks: Any) -> dict[str, tuple[float, ...]]:
     if not all(rate > 0 for of_layers in rates.values() for rate in of_layers):
         raise ValueError("a rate is not positive")
     return rates
+
+
+def _recipes(text: str) -> dict[str, tuple[Recipe, ...]]:
+    """By blocks; what is said of each is what a manifest says."""
+    return {
+        blocks: tuple(recipe_from(one) for one in some) for blocks, some in json.loads(text).items()
+    }
 
 
 def _number(value: Any) -> float:

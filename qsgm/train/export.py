@@ -28,6 +28,7 @@ from qsgm.manifest import (
     OptimizerName,
     Place,
     Precision,
+    Recipe,
     Recipes,
     SgmEntry,
     head_file,
@@ -37,6 +38,7 @@ from qsgm.manifest import (
 )
 from qsgm.network import Network
 from qsgm.progress import Progress
+from qsgm.schedule import Gains
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
@@ -382,15 +384,13 @@ def places(trainee: Trainee, network: bytes) -> dict[str, Place]:
 
 def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Recipes]:
     """Default optimizer and rates of both methods, by blocks."""
-    sgm = {
+    sgm: dict[OptimizerName, dict[str, Recipe]] = {
         name: {
-            str(one): sgm_rates(checkpoint, one)
-            if optimizer.sgm_rate is None
-            else (optimizer.sgm_rate,) * len(one.layers)
+            str(one): sgm_recipe(checkpoint, one, name)
             for one in blocks
             if name in optimizers_of(one)
         }
-        for name, optimizer in OPTIMIZERS.items()
+        for name in OPTIMIZERS
     }
     network = checkpoint.task.network
     whole = [one_block(network.last(tuned)) for tuned in range(1, checkpoint.most_layers + 1)]
@@ -400,7 +400,26 @@ def recipes(checkpoint: Checkpoint, blocks: Sequence[Blocks]) -> dict[Method, Re
     }
     late = meta_trained(checkpoint)  # for which the gain of short runs was found
     gains = {str(one): checkpoint.short_gain if len(one.layers) >= late else 1.0 for one in blocks}
-    return {"sgm": Recipes("sgd", sgm, gains), "bp": Recipes("adam", bp)}
+    usual = checkpoint.recipes.items()
+    found = Recipes(
+        "sgd",
+        {name: {text: one.rates for text, one in some.items()} for name, some in sgm.items()},
+        gains,
+        gains_of(sgm),
+        {text: some[0].optimizer for text, some in usual if some[0].optimizer != "sgd"},
+    )
+    return {"sgm": found, "bp": Recipes("adam", bp)}
+
+
+def gains_of(
+    recipes: Mapping[OptimizerName, Mapping[str, Recipe]],
+) -> dict[OptimizerName, dict[str, Gains]]:
+    """By optimizer and blocks, where they are known by length."""
+    known = {
+        name: {text: one.gains for text, one in some.items() if one.gains}
+        for name, some in recipes.items()
+    }
+    return {name: some for name, some in known.items() if some}
 
 
 def meta_trained(checkpoint: Checkpoint) -> int:
@@ -408,10 +427,25 @@ def meta_trained(checkpoint: Checkpoint) -> int:
     return len(checkpoint.curvatures) or MAML_LAYERS
 
 
-def sgm_rates(checkpoint: Checkpoint, blocks: Blocks) -> tuple[float, ...]:
-    """The checkpoint's for these blocks, else those for as many layers on their own."""
+def sgm_recipe(checkpoint: Checkpoint, blocks: Blocks, name: OptimizerName) -> Recipe:
+    """The checkpoint's for these blocks, else those for as many layers on their own.
+
+    More layers than were meta-trained take the gains of those that were.
+    """
+    known = {
+        (text, one.optimizer): one
+        for text in checkpoint.recipes
+        for one in checkpoint.recipes[text]
+    }
+    if (str(blocks), name) in known:
+        return known[str(blocks), name]
+    usual = OPTIMIZERS[name].sgm_rate
+    if usual is not None:
+        return Recipe(name, (usual,) * len(blocks.layers))
+    late = str(single_layers(checkpoint.task.network.last(meta_trained(checkpoint))))
     single = checkpoint.rates[str(single_layers(blocks.layers))]
-    return checkpoint.rates.get(str(blocks), single)
+    gains = known[late, name].gains if (late, name) in known else ()
+    return Recipe(name, checkpoint.rates.get(str(blocks), single), gains)
 
 
 def sha256(data: bytes) -> str:

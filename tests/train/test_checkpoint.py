@@ -16,6 +16,7 @@ import torch
 from qsgm.errors import QsgmError
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import GraspTask, grasp_task
+from qsgm.manifest import Recipe
 from qsgm.network import Network, conv
 from qsgm.task import Head, TaskRecord, task_record
 from qsgm.train import checkpoint as module
@@ -31,7 +32,12 @@ def checkpoint() -> Checkpoint:
     rates = {"6": (0.03,), "5,6": (0.01, 0.03), "4,5,6": (0.005, 0.001, 0.003)}
     rates["4,5-6"] = (0.02, 0.001, 0.004)
     task = task_record(GraspTask("paper", label_smoothing=0.1))
-    return Checkpoint(task, ConvNet(GRASPNET).eval(), sgms, {}, rates, {"seed": 0})
+    recipes = {
+        "6": (Recipe("adam", (0.01,), ((5, 2.0), (100, 1.0))), Recipe("sgd", (0.03,))),
+        "5,6": (Recipe("sgd", (0.01, 0.03), ((5, 4.0),)),),
+    }
+    net = ConvNet(GRASPNET).eval()
+    return Checkpoint(task, net, sgms, {}, rates, {"seed": 0}, recipes=recipes)
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Checkpoint) -> None:
@@ -41,6 +47,10 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path, checkpoint: Che
         checkpoint.task,
         checkpoint.rates,
         checkpoint.card,
+    )
+    assert (back.recipes, checkpoint.recipes["6"]) == (
+        checkpoint.recipes,
+        (Recipe("adam", (0.01,), ((5, 2.0), (100, 1.0))), Recipe("sgd", (0.03,))),
     )
     assert grasp_task(back.task, "it") == GraspTask("paper", label_smoothing=0.1)
     assert back.sgms[4].hidden == (8, 8)
@@ -122,6 +132,12 @@ def test_someone_elses_checkpoint_is_refused(tmp_path: Path) -> None:
         ("task", "[" * 100_000),
         ("network", '{"layers": []}'),
         ("network", "null"),
+        ("recipes", "{"),
+        ("recipes", "7"),
+        ("recipes", '{"6": [{"optimizer": "lion", "rates": [0.1], "gains": []}]}'),
+        ("recipes", '{"6": [{"optimizer": "adam", "rates": [-0.1], "gains": []}]}'),
+        ("recipes", '{"6": [{"optimizer": "adam", "rates": [0.1, 0.1], "gains": []}]}'),
+        ("recipes", '{"6": [{"optimizer": "adam", "rates": [0.1], "gains": [[9, 1], [5, 1]]}]}'),
     ],
 )
 def test_a_checkpoint_with_a_wrong_part_is_refused(
@@ -337,3 +353,12 @@ def test_weights_that_are_not_finite_are_refused_by_name(
         checkpoint.net.layers[2].conv.bias[0] = float("nan")
     save_checkpoint(tmp_path / "sgm.pt", checkpoint)
     assert "layers.2.conv.bias" in refuse(tmp_path / "sgm.pt")
+
+
+def test_a_checkpoint_from_before_recipes_were_kept_is_read(
+    tmp_path: Path, checkpoint: Checkpoint
+) -> None:
+    save_checkpoint(tmp_path / "sgm.pt", checkpoint)
+    data = torch.load(tmp_path / "sgm.pt", weights_only=True)
+    torch.save({key: value for key, value in data.items() if key != "recipes"}, tmp_path / "old.pt")
+    assert load_checkpoint(tmp_path / "old.pt").recipes == {}

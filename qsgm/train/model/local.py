@@ -6,7 +6,7 @@ so one matrix product advances every task. Convolutions are im2col followed by a
 weights stored as (kernel x kernel x in, out).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -133,16 +133,32 @@ def local_step(
         momentum: of SGD.
         curvatures: by layer, where there is one.
     """
-    updated, x = [], features
-    for layer, state, rate in zip(network.last(len(states)), states, rates, strict=True):
+    given = local_gradients(network, states, features, labels, gradient_of, curvatures)
+    return [
+        sgd(state, *gradients, rate, momentum)
+        for state, gradients, rate in zip(states, given, rates, strict=True)
+    ]
+
+
+def local_gradients(
+    network: Network,
+    states: Sequence[LayerState],
+    features: Tensor,
+    labels: Tensor,
+    gradient_of: GradientOf,
+    curvatures: Mapping[int, Curvature] = FLAT,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Every layer's gradients of weight and bias, one layer after the other.
+
+    Arguments are those of :func:`local_step`.
+    """
+    x = features
+    for layer, state in zip(network.last(len(states)), states, strict=True):
         col = columns(network, layer, x)
         before, x = layer_forward(network, layer, state, col)
         dz = through_activation(network, layer, before, gradient_of(layer, x, labels))
         gradients = weight_gradients(col, dz)
-        if layer in curvatures:
-            gradients = curvatures[layer].precondition(*gradients)
-        updated.append(sgd(state, *gradients, rate, momentum))
-    return updated
+        yield curvatures[layer].precondition(*gradients) if layer in curvatures else gradients
 
 
 def sgd(

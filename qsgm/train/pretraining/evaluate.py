@@ -11,12 +11,21 @@ from torch import Tensor
 
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
+from qsgm.manifest import OptimizerName
 from qsgm.schedule import MOMENTUM, rate_factor
 from qsgm.task import Task
 from qsgm.train.heads import activate, error, meta_objective
 from qsgm.train.model.curvature import Curvature
-from qsgm.train.model.local import GradientOf, LayerState, group_gradients, local_step, outputs
+from qsgm.train.model.local import (
+    GradientOf,
+    LayerState,
+    group_gradients,
+    local_gradients,
+    local_step,
+    outputs,
+)
 from qsgm.train.model.sgm import Sgm
+from qsgm.train.pretraining.adam import AdamMoments
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
@@ -38,6 +47,7 @@ class UpdateRule:
     rates: tuple[float, ...]  # of the tuned layers, at the start of a run
     task: Task
     blocks: Blocks | None = None  # those layers in groups; None: each on its own
+    optimizer: OptimizerName = "sgd"  # Adam bends no gradient, and takes each layer on its own
 
     def gradient_of(self, layer: int, activation: Tensor, labels: Tensor) -> Tensor:
         """Gradient (T, B, P, C) on a layer's activation; labels (T, B, L)."""
@@ -56,20 +66,36 @@ def fine_tune(
 ) -> Iterator[list[LayerState]]:
     """Fine-tune the last layers of every task at once; yields their states after every epoch."""
     states = start_states(start, len(tasks))
+    adam = AdamMoments(states) if rule.optimizer == "adam" else None
     batches = list(shuffled_batches(tasks.support, epochs, seed))
     for step, rows in enumerate(batches, start=1):
         features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
         factor = rate_factor(step - 1, len(batches))
-        rates = [torch.tensor(rate * factor) for rate in rule.rates]
-        network, bent = rule.task.network, rule.curvatures
-        gradient_of: GradientOf = rule.gradient_of
-        if rule.blocks is not None:
-            groups = rule.blocks.groups
-            found = group_gradients(network, groups, states, features, labels, gradient_of)
-            gradient_of = _known(found)
-        states = local_step(network, states, features, labels, rates, gradient_of, MOMENTUM, bent)
+        rates = [rate * factor for rate in rule.rates]
+        states = _step(rule, states, features, labels, rates, adam)
         if step % (len(batches) // epochs) == 0:
             yield states
+
+
+def _step(
+    rule: UpdateRule,
+    states: list[LayerState],
+    features: Tensor,
+    labels: Tensor,
+    rates: Sequence[float],
+    adam: AdamMoments | None,
+) -> list[LayerState]:
+    """One step of every task, by SGD where there are no moments of Adam."""
+    network, bent = rule.task.network, rule.curvatures
+    gradient_of: GradientOf = rule.gradient_of
+    if adam is not None:
+        return adam.step(local_gradients(network, states, features, labels, gradient_of), rates)
+    if rule.blocks is not None:
+        groups = rule.blocks.groups
+        found = group_gradients(network, groups, states, features, labels, gradient_of)
+        gradient_of = _known(found)
+    scalars = [torch.tensor(rate) for rate in rates]
+    return local_step(network, states, features, labels, scalars, gradient_of, MOMENTUM, bent)
 
 
 def _known(gradients: Mapping[int, Tensor]) -> GradientOf:
@@ -85,11 +111,22 @@ def run_sgms(
     chunk: int = 8,
 ) -> Score:
     """Fine-tune every task's last layers, `chunk` tasks at once, and score the result."""
+    return mean_score(run_each(rule, start, tasks, epochs, chunk))
+
+
+def run_each(
+    rule: UpdateRule,
+    start: Sequence[tuple[Tensor, Tensor]],
+    tasks: TaskSet,
+    epochs: int,
+    chunk: int = 8,
+) -> list[Score]:
+    """Every task's score after a run of its own."""
     scores = []
     for some in tasks.chunks(chunk):
         *_, states = fine_tune(rule, start, some, epochs)
         scores += score(states, some, rule.task)
-    return mean_score(scores)
+    return scores
 
 
 @torch.no_grad()

@@ -1,10 +1,12 @@
 """Pretraining in its order: from drawn tasks to a checkpoint, resumable.
 
 1. backbone: the network learns drawn examples by backpropagation.
-2. matching: the SGMs behind the late layers but the last regress true gradients.
+2. matching: the SGMs behind the late layers but the last regress true gradients, along runs of
+   backpropagation, then (for tasks of samples) along runs of their own.
 3. meta: MAML with these SGMs as the update rule, the late layers tuned.
 4. early: the SGMs behind the layers in front of those regress true gradients.
-5. rates: where the device's decaying rates start, the best of a few on drawn lessons of their own.
+5. rates: where the device's decaying rates start, the best of a few on drawn lessons of their own;
+   for tasks of samples also with which optimizer, at every length that a run may have.
 
 A task may add a last stage of its own. What is done so far is kept beside the output as
 `<output>.partial` and taken up again by the same version's same command: output, seed and device.
@@ -23,12 +25,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 import qsgm
 from qsgm.blocks import Blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
+from qsgm.manifest import Recipe
 from qsgm.progress import Progress
 from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
@@ -43,10 +46,13 @@ from qsgm.train.pretraining.first_rates import candidates, choose_first, rate_al
 from qsgm.train.pretraining.maml import MamlConfig, MetaTraining, OuterFigures
 from qsgm.train.pretraining.map_sgms import MapConfig, MapMatching
 from qsgm.train.pretraining.matching import MatchingConfig, fit_sgm, record_examples
+from qsgm.train.pretraining.own_runs import OwnRunsConfig, learn_along_own_runs
 from qsgm.train.pretraining.rates import (
     EARLY_RATE_GRID,
     SHORT_GAINS,
+    AfterRun,
     RatesConfig,
+    Start,
     block_rates,
     choose_early,
     choose_grouped,
@@ -54,6 +60,7 @@ from qsgm.train.pretraining.rates import (
     choose_short_gain,
     late_candidates,
 )
+from qsgm.train.pretraining.recipes import choose_recipes, late_runs
 from qsgm.train.pretraining.resume import Partial
 from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
 from qsgm.train.task import DrawnTask
@@ -74,11 +81,14 @@ class PretrainConfig:
     crops_per_task: int = 400
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
+    own_runs: OwnRunsConfig = field(default_factory=OwnRunsConfig)
     maml: MamlConfig = field(default_factory=MamlConfig)
     early: MapConfig = field(default_factory=MapConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
     # Whether rates are found for the groups of layers in which SGMs pay, too.
     grouped: bool = False
+    # Whether optimizer and rates are found by a run's length: :func:`choose_recipes`.
+    by_length: bool = False
 
     @property
     def late(self) -> int:
@@ -94,8 +104,17 @@ class Learnt:
     first_rates: tuple[float, ...]  # where meta-training started
     rule: UpdateRule  # its rates are those of the late layers
     rates: dict[str, tuple[float, ...]]  # by blocks
+    late: "LateRates"
+
+
+@dataclass(frozen=True)
+class LateRates:
+    """How up to as many layers as were meta-trained are tuned."""
+
+    rates: dict[int, tuple[float, ...]]  # of SGD, by how many they are
     short_gain: float
-    score: Score  # of the late layers, tuned
+    recipes: dict[str, tuple[Recipe, ...]]  # by blocks, where they were found by length
+    score: Score  # of all of them, tuned
 
 
 class LastStage(Protocol):
@@ -154,7 +173,7 @@ def pretrain(
         done = task if last_stage is None else last_stage(learnt, seed, watch)
     command = _command(seed, device, config) + arguments
     config = replace(config, first_rates=learnt.first_rates)
-    card = _card(command, device, config, extra, learnt.score, partial)
+    card = _card(command, device, config, extra, learnt.late.score, partial)
     rule = learnt.rule
     checkpoint = Checkpoint(
         task_record(done),
@@ -163,7 +182,8 @@ def pretrain(
         rule.curvatures,
         learnt.rates,
         card,
-        learnt.short_gain,
+        learnt.late.short_gain,
+        learnt.late.recipes,
     )
     save_checkpoint(output, checkpoint)
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
@@ -184,12 +204,13 @@ def _learn(
     tasks = _draw(net, task, config.tasks, config.crops_per_task, seed + 1, watch, late)
     sgms = _match(partial, net, tasks, config, task, seed, watch)
     first = _first_rates(net, sgms, tasks, config, task, watch)
+    _match_on(partial, net, sgms, tasks, first, config, task, seed, watch)
     rule = _meta_train(partial, net, sgms, tasks, first, config, task, seed, watch)
     early = _match_early(partial, net, rule, task, config, seed, watch)
     rule = replace(rule, sgms={**early, **rule.sgms})
-    rates, gain, score = _choose_rates(net, rule, task, config, seed, watch)
-    rule = replace(rule, rates=rates[str(single_layers(task.network.last(late)))])
-    return Learnt(net, first, rule, rates, gain, score)
+    rates, found = _choose_rates(net, rule, task, config, seed, watch)
+    rule = replace(rule, rates=found.rates[late])
+    return Learnt(net, first, rule, rates, found)
 
 
 @contextmanager
@@ -306,8 +327,16 @@ def _match(
     for layer, sgm in sgms.items():
         fit_sgm(sgm, examples[layer], config.matching, seed + layer, after_step)
     _refuse_unless_finite("matching", *sgms.values())
-    partial.save(sgms={layer: sgm.state_dict() for layer, sgm in sgms.items()})
+    partial.save(sgms=_copied(sgms))
     return sgms
+
+
+def _copied(sgms: dict[int, Sgm]) -> dict[int, dict[str, Tensor]]:
+    """Their state as it is now: later stages change them in place."""
+    return {
+        layer: {name: value.clone() for name, value in sgm.state_dict().items()}
+        for layer, sgm in sgms.items()
+    }
 
 
 def _first_rates(
@@ -330,6 +359,39 @@ def _first_rates(
 
     rule = UpdateRule(sgms, FLAT, (), task)
     return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
+
+
+def _match_on(
+    partial: Partial,
+    net: ConvNet,
+    sgms: dict[int, Sgm],
+    tasks: TaskSet,
+    first_rates: tuple[float, ...],
+    config: PretrainConfig,
+    task: DrawnTask,
+    seed: int,
+    watch: Progress,
+) -> None:
+    """Teach the SGMs, in place, along runs that they drive."""
+    if not config.own_runs.rounds:
+        return
+    if "own" in partial.data:
+        for layer, sgm in sgms.items():
+            sgm.load_state_dict(partial.data["own"][layer])
+        return
+    done, total = 0, len(sgms) * config.own_runs.rounds * config.own_runs.fit.fit_steps
+
+    def after_step() -> None:
+        nonlocal done
+        done += 1
+        watch("own runs", done, total, {})
+
+    start = folded_start(net, config.late)
+    learn_along_own_runs(
+        sgms, start, tasks, first_rates, task, config.own_runs, seed + 7, after_step
+    )
+    _refuse_unless_finite("own runs", *sgms.values())
+    partial.save(own=_copied(sgms))
 
 
 def _meta_train(
@@ -405,13 +467,17 @@ def _choose_rates(
     config: PretrainConfig,
     seed: int,
     watch: Progress,
-) -> tuple[dict[str, tuple[float, ...]], float, Score]:
-    """Rates for all numbers of layers and blocks, short runs' gain, and the late layers' score."""
+) -> tuple[dict[str, tuple[float, ...]], LateRates]:
+    """Rates of SGD for all numbers of layers and blocks, and how the late layers are tuned."""
     sizes, network, late = config.rates, task.network, len(rule.rates)
     tasks = _draw(net, task, sizes.tasks, sizes.crops_per_task, seed + 2, watch, late)
     done = 0
     groups = _groups(rule, late) if config.grouped else []
-    total = len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
+    total = (
+        late_runs(rule.rates)
+        if config.by_length
+        else len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
+    )
     total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
 
     def after_run(score: Score) -> None:
@@ -419,10 +485,8 @@ def _choose_rates(
         done += 1
         watch("rates", done, total, {"objective": score.objective})
 
-    start = folded_start(net, late)
-    rates, score = choose_late(rule, start, tasks, sizes, after_run)
-    rule = replace(rule, rates=rates[late])
-    gain = choose_short_gain(rule, start, tasks, sizes, after_run)
+    found = _late_rates(rule, folded_start(net, late), tasks, config, after_run)
+    rates, rule = dict(found.rates), replace(rule, rates=found.rates[late])
     if late < network.depth:
         count, samples = sizes.early_tasks, sizes.early_crops_per_task
         pixels = _draw(net, task, count, samples, seed + 6, watch, network.depth)
@@ -432,7 +496,26 @@ def _choose_rates(
     else:
         grouped = {}
     singles = {str(single_layers(network.last(k))): of_layers for k, of_layers in rates.items()}
-    return singles | (grouped if config.grouped else block_rates(network, rates[late])), gain, score
+    return singles | (grouped if config.grouped else block_rates(network, rates[late])), found
+
+
+def _late_rates(
+    rule: UpdateRule, start: Start, tasks: TaskSet, config: PretrainConfig, after_run: AfterRun
+) -> LateRates:
+    """Rates of the layers that were meta-trained, and of fewer."""
+    network, sizes = rule.task.network, config.rates
+    if not config.by_length:
+        rates, score = choose_late(rule, start, tasks, sizes, after_run)
+        rule = replace(rule, rates=rates[len(start)])
+        gain = choose_short_gain(rule, start, tasks, sizes, after_run)
+        return LateRates(rates, gain, {}, score)
+    recipes, score = choose_recipes(rule, start, tasks, after_run)
+    rates = {
+        tuned: next(one.rates for one in some if one.optimizer == "sgd")
+        for tuned, some in recipes.items()
+    }
+    named = {str(single_layers(network.last(tuned))): some for tuned, some in recipes.items()}
+    return LateRates(rates, 1.0, named, score)
 
 
 def _groups(rule: UpdateRule, late: int) -> list[Blocks]:

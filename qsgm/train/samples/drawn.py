@@ -15,6 +15,7 @@ from qsgm.train.pretraining.backbone import BackboneConfig
 from qsgm.train.pretraining.maml import MamlConfig
 from qsgm.train.pretraining.map_sgms import MapConfig
 from qsgm.train.pretraining.matching import MatchingConfig
+from qsgm.train.pretraining.own_runs import OwnRunsConfig
 from qsgm.train.pretraining.pretrain import PretrainConfig
 from qsgm.train.pretraining.rates import RatesConfig
 
@@ -87,10 +88,12 @@ def usual_config(task: SampleTask, hidden: tuple[int, ...] = HIDDEN) -> Pretrain
         hidden=hidden,
         first_rates=min(task.tuned, MOST_LATE),
         grouped=True,
+        by_length=True,
         tasks=64,
         crops_per_task=200,
         backbone=BackboneConfig(steps=600, loader_processes=0),
         matching=MatchingConfig(epochs=4, fit_steps=600, fit_batch=512),
+        own_runs=OwnRunsConfig(rounds=3),
         maml=MamlConfig(outer_steps=300, tasks_per_step=4, unroll=10, run_lengths=(5, 15, 50, 100)),
         early=MapConfig(tasks=12, crops_per_task=80, epochs=8, looks=(1, 4, 8), steps=150),
         rates=RatesConfig(
@@ -111,9 +114,15 @@ def quicker(config: PretrainConfig, share: float) -> PretrainConfig:
     def part(count: int, least: int) -> int:
         return max(least, round(share * count))
 
+    own = config.own_runs.fit
     stages = {
         "backbone": replace(config.backbone, steps=part(config.backbone.steps, 100)),
         "matching": replace(config.matching, fit_steps=part(config.matching.fit_steps, 50)),
+        "own_runs": replace(
+            config.own_runs,
+            tasks=part(config.own_runs.tasks, 8),
+            fit=replace(own, fit_steps=part(own.fit_steps, 50)),
+        ),
         "maml": replace(config.maml, outer_steps=part(config.maml.outer_steps, 10)),
         "early": replace(config.early, steps=part(config.early.steps, 20)),
         "rates": replace(config.rates, tasks=part(config.rates.tasks, 3)),
