@@ -28,7 +28,7 @@ GRID = [Recipe("adam", (rate, rate)) for rate in (3e-3, 1e-2, 3e-2)]
 GRID += [
     Recipe("adam", rates) for rates in ((1e-3, 3e-2), (3e-3, 1e-2), (3e-3, 3e-2), (1e-2, 3e-2))
 ]
-GRID += [Recipe("sgd", (rate, rate)) for rate in (0.1, 0.3)]
+GRID += [Recipe("sgd", rates) for rates in ((0.05, 0.1), (0.1, 0.1), (0.1, 0.2), (0.3, 0.3))]
 ALONE = [Recipe("adam", (rate,)) for rate in (1e-2, 3e-2, 1e-1)] + [Recipe("sgd", (0.3,))]
 NEIGHBOURS = (1, 3, 5, 9)
 METHODS = {
@@ -65,15 +65,16 @@ def bundle_without(task, person, folder):
 
 
 def sizes(task):
-    """Half of the usual steps. SGMs that match true gradients are left at that: none is bent."""
+    """Half of the usual steps, rates at which backpropagation does well, no meta-training."""
     from qsgm.train import quicker, usual_config
 
     half = quicker(usual_config(task), 0.5)
-    rates = replace(half.rates, tasks=4, early_tasks=1, early_epochs=3, early_crops_per_task=40)
+    rates = replace(half.rates, tasks=8, early_tasks=1, early_epochs=3, early_crops_per_task=40)
     return replace(
         half,
-        tasks=128,
-        first_rates=(0.03, 0.1),
+        hidden=(64, 64),
+        first_rates=(0.1, 0.2),
+        own_runs=usual_config(task).own_runs,
         backbone=replace(half.backbone, steps=400),
         maml=replace(half.maml, outer_steps=1),
         rates=rates,
