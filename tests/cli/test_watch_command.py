@@ -129,7 +129,9 @@ def test_without_a_stdout_the_video_is_written_all_the_same(belt: Path, tmp_path
     assert len(list(watch(tmp_path / "seen.avi", []))) == FRAMES
 
 
-def test_any_distance_finds_what_predict_finds_at_another_one(qsgm: Run, tmp_path: Path) -> None:
+def test_any_distance_finds_what_predict_finds_by_itself_at_another_one(
+    qsgm: Run, tmp_path: Path
+) -> None:
     paths.remember_object(teach(paths.folder_named("toy"), "toy", toy()))
     picture, middle = tmp_path / "near.png", (300.0, 240.0)
     write_png(picture, lay(toy(), table(4), middle, 40, 2.2))
@@ -137,5 +139,8 @@ def test_any_distance_finds_what_predict_finds_at_another_one(qsgm: Run, tmp_pat
     (near,) = json.loads(qsgm("watch", picture, "--any-distance").out)["objects"]
     assert [here["found"], near["found"]] == [False, True]
     assert near["center_px"] == pytest.approx(middle, abs=3)
-    told = qsgm("predict", "--json", "--any-distance", picture).json
+    told, same = (
+        qsgm("predict", "--json", *how, picture).json for how in ((), ("--same-distance",))
+    )
     assert {key: told[key] for key in near} == near
+    assert not same["found"]
