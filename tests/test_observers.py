@@ -274,6 +274,11 @@ def test_of_clips_that_lose_as_little_entropy_takes_the_widest() -> None:
     assert entropy_clip(counts, 0, 256) == (0, 1000)
 
 
+def test_every_number_is_counted_once() -> None:
+    values = heavy_tailed("student")
+    assert (observed(values).counts.sum(axis=1) == len(values)).all()
+
+
 @pytest.mark.parametrize("levels", [256, 65536])
 @pytest.mark.parametrize("name", sorted(CALIBRATORS))
 def test_every_tensor_of_an_sgm_has_its_calibrators_range(name: str, levels: int) -> None:

@@ -14,7 +14,7 @@ from qsgm.grasp.finding import Sighting, confidence_of
 from qsgm.grasp.judge import JUDGED, PROPOSED, Appearance, _opposite, cell_center, judge
 from qsgm.grasp.patch import Patch, cut_patch
 from qsgm.grasp.shown import View
-from qsgm.grasp.tuned import _as_detection
+from qsgm.grasp.tuned import _around, _as_detection
 
 CENTER = (320.0, 240.0)
 APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
@@ -38,6 +38,15 @@ def test_only_a_cell_next_to_a_candidate_is_none_itself() -> None:
     for cell, value in zip(around, (0.8, 0.7, 0.6, 0.5, 0.85, 0.85), strict=True):
         quality[cell] = value
     assert candidate_cells(quality, 5) == [(3, 3), *around[:4]]
+
+
+@pytest.mark.parametrize("cell", [(0, 0), (0, 5), (5, 0), (5, 5), (2, 3)])
+def test_around_a_cell_its_neighbours_keep_their_quality(cell: tuple[int, int]) -> None:
+    alone = _around(np.ones((3, 6, 6), np.float32), cell)
+    rows, cols = np.indices((6, 6))
+    near = np.maximum(np.abs(rows - cell[0]), np.abs(cols - cell[1])) <= 1
+    np.testing.assert_array_equal(alone[0], near)
+    assert (alone[1:] == 1).all()
 
 
 def test_as_many_places_are_judged_as_are_asked_for() -> None:
