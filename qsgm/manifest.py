@@ -28,6 +28,8 @@ NETWORK = "network.onnx"
 WEIGHTS = "weights.bin"
 FLOAT_BYTES = 4
 MANIFEST_BYTES = 4_000_000
+# Up to here a float64 tells whole numbers apart.
+LARGEST_WHOLE = 2**53
 COMMAND = "qsgm fold-and-quantize"
 
 Method = Literal["sgm", "bp"]
@@ -302,11 +304,20 @@ def require_keys(
     """
     for key, kind in keys.items():
         value = values.get(key)
-        if not isinstance(value, kind) or isinstance(value, bool):
+        if not _is_of(value, kind):
             got = "nothing" if key not in values else type(value).__name__
             raise QsgmError(
                 f"{path}: {key!r} holds {got}, expected {kind.__name__}; make it with `{command}`"
             )
+
+
+def _is_of(value: object, kind: type) -> bool:
+    """Whether JSON's value is of a kind; it may write a float as a whole number."""
+    if isinstance(value, bool):
+        return False
+    if kind is float and isinstance(value, int):
+        return abs(value) <= LARGEST_WHOLE
+    return isinstance(value, kind)
 
 
 @dataclass(frozen=True)

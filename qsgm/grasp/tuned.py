@@ -341,7 +341,7 @@ def _read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
             f"offset_rad, got {encoding!r} and {offset_rad}; {_ADVICE}"
         )
     network = unaltered(folder, NETWORK, manifest["sha256"], MOST_BYTES, _ADVICE)
-    description = ObjectDescription(as_text(name), encoding, offset_rad)
+    description = ObjectDescription(as_text(name), encoding, float(offset_rad))
     if not first:
         description = _with_looks(description, folder, manifest)
     return description, network

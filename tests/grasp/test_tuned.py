@@ -121,6 +121,20 @@ def test_a_description_that_says_nonsense_is_refused(saved: Path, key: str, valu
     assert "expected encoding double or paper and a finite offset_rad" in refusal(saved)
 
 
+def test_a_float_may_be_written_as_a_whole_number(saved: Path) -> None:
+    """As JavaScript writes 1.0; not as a truth value, and not beyond what a float holds."""
+    path, taught = saved / "object.json", load_object(saved).description
+    whole = json.loads(path.read_text()) | {"offset_rad": 1, "scale": 1}
+    path.write_text(json.dumps(whole))
+    about = load_object(saved).description
+    assert (about.offset_rad, about.scale) == (1.0, 1.0)
+    assert isinstance(about.offset_rad, float)
+    assert about.name == taught.name
+    for wrong in (True, 10**400):
+        path.write_text(json.dumps(whole | {"scale": wrong}))
+        assert "'scale' holds" in refusal(saved)
+
+
 def test_a_network_that_is_another_graph_is_refused(bundle: Bundle, tmp_path: Path) -> None:
     save_object(tmp_path / "mug", MUG, (bundle.folder / "trunk_float_6.onnx").read_bytes(), {})
     text = refusal(tmp_path / "mug")
