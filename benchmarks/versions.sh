@@ -14,7 +14,7 @@ host=${HOST_PYTHON:-$here/.venv-test/bin/python}
 # Nothing of the source tree but what tests read beside the package.
 mkdir -p "$work/elsewhere"
 cd "$here"
-cp -R tests docs examples deploy benchmarks calib export ./*.md Makefile pyproject.toml "$work/elsewhere"
+cp -R tests docs examples deploy benchmarks calib export sgm.pt ./*.md Makefile pyproject.toml "$work/elsewhere"
 PYTHONPATH=$here:tests "$host" tests/random_bundle.py "$work/bundle"
 "$host" -m pip wheel --disable-pip-version-check --quiet --no-deps -w "$work" .
 

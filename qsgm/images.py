@@ -52,7 +52,7 @@ _SENSOR_BITS = (10, 12, 14, 16)
 _COMPLAINT = re.compile(
     rb"libpng |Corrupt JPEG|Premature end of JPEG|Inconsistent progression|Invalid SOS|"
     rb"Unsupported|Unknown Adobe|Warning: unknown JFIF|\[[\w,]+ @ 0x|Truncating packet|"
-    rb"Unexpected element|\[ *(?:WARN|ERROR):.*(?:grfmt|loadsave|cap[._])"
+    rb"Unexpected element|\[ *(?:WARN|ERROR):.*(?:grfmt|loadsave|cap[._]|obsensor)"
 )
 # Those after which the picture is not what was taken. Some cameras pad; that does no harm.
 _DAMAGE = re.compile(

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 import qsgm
 
 TOP = Path(qsgm.__file__).parent
@@ -92,6 +94,7 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def test_graphs_are_built_and_made_slim_without_torch() -> None:
+    pytest.importorskip("onnx")
     modules = inside(["train.graphs", "train.slim"])
     assert [name for name in sorted(modules) if "torch" in set(imported([parsed(name)]))] == []
     code = "import importlib, sys; [importlib.import_module(name) for name in sys.argv[1:]]"
@@ -107,6 +110,7 @@ def test_graphs_are_built_and_made_slim_without_torch() -> None:
 
 def test_everything_that_benchmarks_and_examples_ask_of_the_package_is_there() -> None:
     """They run for minutes or need other packages, so that tests run few of them."""
+    pytest.importorskip("torch")
     root = TOP.parent
     scripts = [
         file for folder in ("benchmarks", "examples") for file in root.glob(f"{folder}/**/*.py")

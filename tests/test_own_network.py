@@ -33,6 +33,7 @@ from qsgm import (
 from qsgm.task import heads_to_json
 from qsgm.train import from_torch, load_checkpoint
 from qsgm.train.pretraining.first_rates import candidates
+from qsgm.train.pretraining.own_runs import OwnRunsConfig
 from qsgm.train.pretraining.rates import EARLY_RATE_GRID
 from qsgm.train.samples import build as building
 from qsgm.train.samples.drawn import quicker, usual_config
@@ -44,7 +45,8 @@ FILE = EXAMPLES / "digits_task.py"
 def small(task: SampleTask, **chosen: Any) -> Any:
     config = replace(quicker(usual_config(task, **chosen), 0.1), first_rates=(5e-3, 1e-1))
     early = replace(config.early, tasks=3, crops_per_task=40, epochs=2, looks=(1, 2))
-    return replace(config, early=early)
+    own = replace(config.own_runs, tasks=4, epochs=4)
+    return replace(config, early=early, own_runs=own, rates=replace(config.rates, tasks=3))
 
 
 def samples(path: Path, count: int = 250) -> Path:
@@ -371,7 +373,8 @@ def test_a_trained_network_is_taken_as_it_is(tmp_path: Path) -> None:
     net = from_torch(module, (8, 8, 1), "pixels")
     start = {name: value.clone() for name, value in net.state_dict().items()}
     task = type(digits())("digits", net.network, digits().heads)
-    options, config = building.ExportOptions(epochs=1), small(task)
+    config = replace(small(task), by_length=False, own_runs=OwnRunsConfig())
+    options = building.ExportOptions(epochs=1)
     building.build(task, tmp_path / "own", net, config=config, options=options)
     assert all(torch.equal(value, start[name]) for name, value in net.state_dict().items())
     assert load_bundle(tmp_path / "own").network == net.network

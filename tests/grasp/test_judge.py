@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from toys import bump, lay, plain, table, toy
 
+from qsgm.grasp import judge as judging
 from qsgm.grasp.angles import full_degrees
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.correlation import Fit, coarse_fits, middle_fit, pyramid_of
@@ -49,12 +51,20 @@ def test_around_a_cell_its_neighbours_keep_their_quality(cell: tuple[int, int]) 
     assert (alone[1:] == 1).all()
 
 
-def test_as_many_places_are_judged_as_are_asked_for() -> None:
+def test_as_many_places_are_judged_as_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view of many instances asks the network for twice as many cells."""
+    asked, cells_of = list[int](), judging.candidate_cells
+
+    def counted(quality: NDArray[np.float32], count: int) -> list[tuple[int, int]]:
+        asked.append(count)
+        return cells_of(quality, count)
+
+    monkeypatch.setattr(judging, "candidate_cells", counted)
     places = [(100.0 + 110 * i, 100.0 + 110 * j) for i in range(5) for j in range(3)]
-    found = judge(APPEARANCE, table(1), bump(places), count=len(places))
-    near = {min(places, key=lambda at: math.dist(at, one.cell_px)) for one in found}
-    assert len(near) > PROPOSED
-    assert len(found) <= len(places)
+    many = judge(APPEARANCE, table(1), bump(places), count=len(places))
+    few = judge(APPEARANCE, table(1), bump(places), count=2)
+    assert asked == [2 * len(places), PROPOSED]
+    assert len(few) <= 2 < len(many) <= len(places)
 
 
 def test_a_cell_looks_at_the_middle_of_its_window() -> None:

@@ -28,7 +28,15 @@ from qsgm.train.grasp.episodes import Episode, EpisodeMaker
 CENTER = (320.0, 240.0)
 CELLS = Cells.of(Template(cut_patch(lay(toy(), table(), CENTER), CENTER)))
 SMALL = ComparerConfig(
-    episodes=1, scenes=3, channels=(6, 6, 6, 6), hidden=8, passes=60, batch=16, of_the_object=8
+    episodes=1,
+    scenes=3,
+    tables=2,
+    others=12,
+    channels=(6, 6, 6, 6),
+    hidden=8,
+    passes=30,
+    batch=16,
+    of_the_object=8,
 )
 
 

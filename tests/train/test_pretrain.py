@@ -61,9 +61,17 @@ TASK = DrawnGrasping()
 LAST = DecisionStage(
     TASK,
     ComparerConfig(
-        episodes=2, scenes=2, channels=(4, 4, 4, 4), hidden=4, passes=1, batch=8, of_the_object=3
+        episodes=2,
+        scenes=2,
+        tables=2,
+        others=12,
+        channels=(4, 4, 4, 4),
+        hidden=4,
+        passes=1,
+        batch=8,
+        of_the_object=3,
     ),
-    DecisionScenesConfig(episodes=2, scenes=2, crops=20, support=16, epochs=1),
+    DecisionScenesConfig(episodes=2, scenes=2, tables=2, others=12, crops=20, support=16, epochs=1),
     DecisionConfig(hidden=4, steps=5, folds=2),
 )
 

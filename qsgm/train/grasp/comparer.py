@@ -32,7 +32,7 @@ from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, pyramid_of
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import PATCH_PX, cut_patch
 from qsgm.train.grasp.drawing.scenes import DrawnScene
-from qsgm.train.grasp.episodes import CENTER_PX, USUAL, Episode, EpisodeMaker
+from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker
 
 Image = NDArray[np.uint8]
 # (frame) -> heatmap
@@ -52,6 +52,8 @@ class ComparerConfig:
 
     episodes: int = 320
     scenes: int = 8  # with the object, and as many without it
+    tables: int = TABLES
+    others: int = OTHERS  # that lie there
     channels: tuple[int, ...] = (16, 24, 32, 32)
     hidden: int = 32
     passes: int = 10  # over as many examples as there are
@@ -86,7 +88,7 @@ def draw_examples(
         seed: of the objects and scenes.
         after_episode: told about each object.
     """
-    maker = EpisodeMaker(seed, USUAL)
+    maker = EpisodeMaker(seed, USUAL, config.tables, config.others)
     taught, solid, seen, of, mine = [], [], list[Image](), list[int](), list[bool]()
     for number in range(config.episodes):
         episode = maker.draw(number, config.scenes, without=True)

@@ -18,7 +18,7 @@ from qsgm.task import Heads
 from qsgm.train.grasp.comparer import Look
 from qsgm.train.grasp.decision import JudgedScene, Weighed
 from qsgm.train.grasp.drawing.scenes import DrawnScene
-from qsgm.train.grasp.episodes import CENTER_PX, USUAL, Episode, EpisodeMaker
+from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker
 from qsgm.train.grasp.task import DrawnGrasping, frame_lesson, shipped_things
 from qsgm.train.heads import activate
 from qsgm.train.model.local import LayerState
@@ -33,6 +33,8 @@ class DecisionScenesConfig:
 
     episodes: int = 240
     scenes: int = 8  # with the object, and as many without it
+    tables: int = TABLES
+    others: int = OTHERS  # that lie there
     crops: int = 1000
     support: int = 800
     epochs: int = 20
@@ -59,7 +61,7 @@ def judged_scenes(
         seed: of the episodes.
         after_episode: told about each.
     """
-    maker = EpisodeMaker(seed, USUAL)
+    maker = EpisodeMaker(seed, USUAL, config.tables, config.others)
     judged: list[JudgedScene] = []
     for first in range(0, config.episodes, config.tasks_at_once):
         numbers = range(first, min(first + config.tasks_at_once, config.episodes))
