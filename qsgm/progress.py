@@ -1,6 +1,7 @@
 """How long work tells its progress."""
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Protocol
 
@@ -21,3 +22,16 @@ def ignore(
     _stage: str, _done: int, _of: int, _figures: Mapping[str, float] = NO_FIGURES, /
 ) -> None:
     """Watch nothing."""
+
+
+def counted(watch: Progress, stage: str, of: int) -> Callable[..., None]:
+    """A function that tells, whenever it is called, that one more of so many is done.
+
+    It takes figures worth showing, or nothing.
+    """
+    numbers = itertools.count(1)
+
+    def tell(figures: Mapping[str, float] = NO_FIGURES) -> None:
+        watch(stage, next(numbers), of, figures)
+
+    return tell

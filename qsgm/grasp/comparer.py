@@ -39,7 +39,7 @@ _TINY = 1e-3
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution, or a product where K is not 9 times the channels in front of it."""
+    """Weights of a convolution, or of a product behind the last maps."""
 
     weight: Floats  # (K, Co); of a convolution row by row, column by column, channel by channel
     bias: Floats  # (Co,)
@@ -89,30 +89,36 @@ class Comparer:
             QsgmError: its numbers are not what they should be.
         """
         try:
-            channels = [int(count) for count in values["channels"]]
-            sane = len(channels) == len(STRIDES) + 1 and 1 <= min(channels) <= max(channels)
-            if not sane or max(channels) > MOST_CHANNELS:
-                raise ValueError
-            shapes = _shapes(channels)
-            sizes = [rows * columns for rows, columns in shapes]
-            codes = base64.b64decode(values["codes"], validate=True)
-            with np.errstate(over="ignore"):  # infinity is refused below
-                all_codes = np.frombuffer(codes, np.int8).astype(np.float32)
-                wide = [columns for _, columns in shapes]
-                scales, biases = (
-                    np.split(np.array(values[name], np.float32).reshape(sum(wide)), _ends(wide))
-                    for name in ("scales", "biases")
-                )
-            weights = np.split(all_codes.reshape(sum(sizes)), _ends(sizes))
-            layers = [
-                Layer(np.asarray(weight.reshape(shape) * scale, np.float32), bias)
-                for weight, shape, scale, bias in zip(weights, shapes, scales, biases, strict=True)
-            ]
+            layers = _layers_from(values)
         except (KeyError, TypeError, ValueError, OverflowError, binascii.Error) as error:
             raise QsgmError(f"{where}: the comparer's numbers do not fit; {_ADVICE}") from error
         if not all(np.isfinite(one.weight).all() and np.isfinite(one.bias).all() for one in layers):
             raise QsgmError(f"{where}: the comparer's numbers are not finite; {_ADVICE}")
         return Comparer(tuple(layers[:-2]), *layers[-2:])
+
+
+def _layers_from(values: Mapping[str, Any]) -> list[Layer]:
+    """All layers. Raises what wrong values raise."""
+    shapes = _shapes(_channels_from(values["channels"]))
+    sizes, wide = ([rows * columns for rows, columns in shapes], [one for _, one in shapes])
+    codes = np.frombuffer(base64.b64decode(values["codes"], validate=True), np.int8)
+    with np.errstate(over="ignore"):  # infinity is refused by whoever asks
+        scales, biases = (
+            np.split(np.array(values[name], np.float32).reshape(sum(wide)), _ends(wide))
+            for name in ("scales", "biases")
+        )
+    weights = np.split(codes.astype(np.float32).reshape(sum(sizes)), _ends(sizes))
+    return [
+        Layer(weight.reshape(shape) * scale, bias)
+        for weight, shape, scale, bias in zip(weights, shapes, scales, biases, strict=True)
+    ]
+
+
+def _channels_from(values: Any) -> list[int]:
+    channels = [int(count) for count in values]
+    if len(channels) != len(STRIDES) + 1 or not all(1 <= one <= MOST_CHANNELS for one in channels):
+        raise ValueError(f"channels are {channels}")
+    return channels
 
 
 _ADVICE = "make it again with this version of qsgm"
@@ -122,12 +128,10 @@ def side_by_side(cells: Cells, seen: NDArray[np.uint8]) -> Floats:
     """Taught, seen in the same light, their difference and the mask: (N, 64, 64, 10)."""
     solid = cells.solid[..., None]
     size = np.float32(cells.solid.sum() + _TINY)
-    (taught,), here = (
-        np.asarray(some, np.float32) for some in (cells.image[None], seen)
-    )  # (64, 64, 3), (N, 64, 64, 3)
-    mean, spread = _light(taught[None], solid, size)
+    taught, here = cells.image[None], seen.astype(np.float32)
+    mean, spread = _light(taught, solid, size)
     its_mean, its_spread = _light(here, solid, size)
-    gain = np.clip(np.sqrt(spread / its_spread), LEAST_GAIN, MOST_GAIN).astype(np.float32)
+    gain = np.clip(np.sqrt(spread / its_spread), LEAST_GAIN, MOST_GAIN)
     lit = (here - its_mean) * gain
     own = np.broadcast_to(taught - mean, lit.shape)
     mask = np.broadcast_to(2 * solid - 1, (*lit.shape[:3], 1))

@@ -83,11 +83,11 @@ class Decision:
         Raises:
             QsgmError: it weighs other evidence, or its numbers are not what they should be.
         """
-        compares = isinstance(values, Mapping) and "comparer" in values
-        names = _names(compares)
-        if not isinstance(values, Mapping) or values.get("evidence") != names:
+        known = values if isinstance(values, Mapping) else {}
+        names = _names("comparer" in known)
+        if known.get("evidence") != names:
             raise QsgmError(f"{where}: the decision weighs other evidence; {_ADVICE}")
-        comparer = Comparer.from_json(values["comparer"], where) if compares else None
+        comparer = Comparer.from_json(values["comparer"], where) if "comparer" in known else None
         try:
             with np.errstate(over="ignore"):  # infinity is refused below
                 hidden_bias = np.array(values["hidden_bias"], np.float32)

@@ -5,19 +5,18 @@ from math import inf, log
 
 import pytest
 import torch
+from nets import toy_start, toy_tasks
 from toy_task import ToyTask
 
 from qsgm import QsgmError
 from qsgm.train.model.curvature import FLAT
-from qsgm.train.model.fold import folded_start
-from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining import first_rates
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, run_sgms
 from qsgm.train.pretraining.first_rates import ALONE_GRID, candidates, choose_first, rate_alone
 from qsgm.train.pretraining.matching import MatchingConfig
 from qsgm.train.pretraining.rates import Rates, RatesConfig, Start
-from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
+from qsgm.train.pretraining.tasks import TaskSet
 
 TASK = ToyTask()
 MATCHING = MatchingConfig(epochs=4)
@@ -26,14 +25,12 @@ LENGTHS = RatesConfig(epochs=6, short_epochs=2)
 
 @pytest.fixture(scope="module")
 def start() -> Start:
-    torch.manual_seed(0)
-    return folded_start(ConvNet(TASK.network).eval(), 2)
+    return toy_start()
 
 
 @pytest.fixture(scope="module")
 def tasks() -> TaskSet:
-    torch.manual_seed(0)
-    return draw_tasks(ConvNet(TASK.network).eval(), TASK, 3, 80, 1, lambda: None, last_frozen=2)
+    return toy_tasks(3)
 
 
 def rule() -> UpdateRule:

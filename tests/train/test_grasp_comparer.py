@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from toys import lay, table, toy
+from toys import bump, lay, table, toy
 
 from qsgm.grasp.cells import Cells
 from qsgm.grasp.correlation import Template
 from qsgm.grasp.patch import cut_patch
-from qsgm.train.grasp import comparer
 from qsgm.train.grasp.comparer import (
     Batch,
     ComparerConfig,
@@ -80,7 +79,7 @@ def test_what_is_frozen_answers_as_what_was_learnt() -> None:
 
 def test_it_learns_to_tell_what_is_alike_from_what_is_not() -> None:
     examples, steps = alike_or_not(), list[tuple[int, int]]()
-    learnt = train_comparer(examples, SMALL, 0, lambda done, of: steps.append((done, of)))
+    learnt = train_comparer(examples, SMALL, 0, lambda _, done, of, *__: steps.append((done, of)))
     assert steps[-1][0] == steps[-1][1] == SMALL.passes * len(examples) // SMALL.batch
     taught, everywhere = examples.taught[0].astype(np.float32), np.ones((64, 64), np.float32)
     whole = replace(CELLS, image=taught, solid=everywhere)
@@ -94,32 +93,39 @@ def test_varied_examples_keep_the_object_where_its_mask_is() -> None:
     solid[:, :20, :30] = 255
     bright = np.repeat(solid[..., None], 3, axis=3)
     lit = Examples(bright, solid, np.repeat(bright, 8, axis=0), examples.of, examples.mine)
+    corners = set[int]()
     for _ in range(40):
         batch: Batch = varied(batch_of(lit, np.arange(8)), rng)
-        inside = batch.taught[batch.solid.expand_as(batch.taught) > 0.5]
-        outside = batch.taught[batch.solid.expand_as(batch.taught) < 0.5]
-        assert {float(inside.min()), float(inside.max())} <= {0.0, 255.0}
-        assert float(inside.mean()) != float(outside.mean())
+        inside = batch.solid.expand_as(batch.taught) > 0.5
+        (on,), (off,) = batch.taught[inside].unique(), batch.taught[~inside].unique()
+        assert {float(on), float(off)} == {0.0, 255.0}
         assert batch.seen.min() >= 0
         assert batch.seen.max() <= 255
+        # Of eight views some are covered, none of them all over.
+        contrast = batch.seen[inside].mean() - batch.seen[~inside].mean()
+        assert (contrast > 50) if on > off else (contrast < -50)
+        corners.add(int(batch.solid[0].flatten().argmax()))
+    assert len(corners) >= 4  # turned and mirrored
 
 
 def test_another_thing_where_the_object_was_is_not_the_object(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whatever lies in scenes without it, no example of these is the object's."""
-    config = replace(SMALL, scenes=4)
-    monkeypatch.setattr(comparer, "_at_true_pose", lambda *_: iter(()))
+    """A network that sees that thing: of scenes without the object no example is of it."""
+    places = dict[int, tuple[float, float]]()
     draw = EpisodeMaker.draw
 
     def without_alone(*given: Any, **more: Any) -> Episode:
         episode = draw(*given, **more)
-        assert any(scene.mask.any() for scene in episode.without), "a thing lies there"
-        return replace(episode, scenes=())
+        there = [scene for scene in episode.without if scene.center_px is not None]
+        places.update({id(one.image): one.center_px for one in there if one.center_px})
+        return replace(episode, scenes=(), without=tuple(there))
 
     monkeypatch.setattr(EpisodeMaker, "draw", without_alone)
-    examples = draw_examples(nowhere, config, 1, lambda: None)
-    assert len(examples) > 0
+    config = replace(SMALL, scenes=8)
+    examples = draw_examples(lambda frame: bump([places[id(frame)]]), config, 1, lambda: None)
+    assert len(places) > 1
+    assert len(examples) > len(places)
     assert not examples.mine.any()
 
 

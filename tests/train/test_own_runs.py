@@ -6,13 +6,12 @@ from functools import partial
 
 import pytest
 import torch
+from nets import toy_start, toy_tasks
 from torch import Tensor
 from torch.nn import functional as F
 from toy_task import ToyTask
 
 from qsgm.schedule import MOMENTUM, rate_factor
-from qsgm.train.model.fold import folded_start
-from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.matching import Examples, MatchingConfig
@@ -22,7 +21,7 @@ from qsgm.train.pretraining.own_runs import (
     looks_along,
 )
 from qsgm.train.pretraining.rates import Start
-from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, shuffled_batches
+from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches
 
 TASK = ToyTask()
 FIT = MatchingConfig(fit_steps=80, fit_batch=128)
@@ -32,14 +31,12 @@ RATES = (0.1, 0.1)
 
 @pytest.fixture(scope="module")
 def start() -> Start:
-    torch.manual_seed(0)
-    return folded_start(ConvNet(TASK.network).eval(), 2)
+    return toy_start()
 
 
 @pytest.fixture(scope="module")
 def tasks() -> TaskSet:
-    torch.manual_seed(0)
-    return draw_tasks(ConvNet(TASK.network).eval(), TASK, 4, 80, 1, lambda: None, last_frozen=2)
+    return toy_tasks(4)
 
 
 def sgm() -> Sgm:

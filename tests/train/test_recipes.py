@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nets import toy_start, toy_tasks
 from toy_task import ToyTask
 
 from qsgm.train.model.curvature import FLAT
-from qsgm.train.model.fold import folded_start
-from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.paper.baselines.static_sgms import StaticSgms
 from qsgm.train.paper.baselines.tuning import Recipe as OracleRecipe
@@ -18,7 +17,7 @@ from qsgm.train.pretraining.evaluate import Score, UpdateRule, fine_tune, run_ea
 from qsgm.train.pretraining.map_sgms import behind
 from qsgm.train.pretraining.rates import Start
 from qsgm.train.pretraining.recipes import choose_recipes, late_runs
-from qsgm.train.pretraining.tasks import TaskSet, draw_tasks, start_states
+from qsgm.train.pretraining.tasks import TaskSet, start_states
 
 TASK = ToyTask()
 LEARNT = (0.01, 0.05)
@@ -26,14 +25,12 @@ LEARNT = (0.01, 0.05)
 
 @pytest.fixture(scope="module")
 def start() -> Start:
-    torch.manual_seed(0)
-    return folded_start(ConvNet(TASK.network).eval(), 2)
+    return toy_start()
 
 
 @pytest.fixture(scope="module")
 def tasks() -> TaskSet:
-    torch.manual_seed(0)
-    return draw_tasks(ConvNet(TASK.network).eval(), TASK, 3, 80, 1, lambda: None, last_frozen=2)
+    return toy_tasks(3)
 
 
 @pytest.fixture(autouse=True)

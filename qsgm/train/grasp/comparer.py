@@ -31,6 +31,7 @@ from qsgm.grasp.comparer import (
 from qsgm.grasp.correlation import NOISE_VARIANCE, Fit, pyramid_of
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import PATCH_PX, cut_patch
+from qsgm.progress import Progress, counted
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker
 
@@ -187,7 +188,7 @@ def _light(images: Tensor, solid: Tensor, size: Tensor) -> tuple[Tensor, Tensor]
 
 
 def train_comparer(
-    examples: Examples, config: ComparerConfig, seed: int, after_step: Callable[[int, int], None]
+    examples: Examples, config: ComparerConfig, seed: int, watch: Progress
 ) -> Comparer:
     """Learn from examples.
 
@@ -195,7 +196,7 @@ def train_comparer(
         examples: some of the object, some not.
         config: sizes and rates.
         seed: of everything random.
-        after_step: told how many steps of how many are done.
+        watch: told about every step.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -207,8 +208,9 @@ def train_comparer(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, config.peak_rate, total_steps=steps + 1
     )
+    after_step = counted(watch, "comparer", steps)
     mine, others = np.flatnonzero(examples.mine), np.flatnonzero(~examples.mine)
-    for done in range(1, steps + 1):
+    for _ in range(steps):
         others_count = config.batch - config.of_the_object
         rows = np.concatenate(
             [rng.choice(mine, config.of_the_object), rng.choice(others, others_count)]
@@ -220,7 +222,7 @@ def train_comparer(
         loss.backward()
         optimizer.step()
         schedule.step()
-        after_step(done, steps)
+        after_step()
     return net.frozen()
 
 

@@ -5,8 +5,7 @@ network that compares a candidate with the taught object, and how all evidence f
 weighed.
 """
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.task import GraspTask
-from qsgm.progress import Progress
+from qsgm.progress import Progress, counted
 from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.grasp.comparer import ComparerConfig, draw_examples, train_comparer
 from qsgm.train.grasp.decision import DecisionConfig, fit_decision
@@ -44,7 +43,7 @@ class DecisionStage:
     def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> GraspTask:
         start = folded_start(learnt.net, len(learnt.rule.rates))
         comparer = self._comparer(learnt, start, seed + 11, watch)
-        count = _counted("decision", self.scenes.episodes, watch)
+        count = counted(watch, "decision", self.scenes.episodes)
         judged = judged_scenes(
             learnt.net, learnt.rule, start, comparer, self.scenes, seed + 7, count
         )
@@ -53,19 +52,9 @@ class DecisionStage:
     def _comparer(self, learnt: Learnt, start: Start, seed: int, watch: Progress) -> Comparer:
         states = start_states(start, 1)
         look = partial(heatmap_of, learnt.net, states, heads=self.task.heads)
-        count = _counted("examples", self.comparer.episodes, watch)
+        count = counted(watch, "examples", self.comparer.episodes)
         examples = draw_examples(look, self.comparer, seed, count)
-
-        def after_step(done: int, steps: int) -> None:
-            watch("comparer", done, steps, {})
-
-        return train_comparer(examples, self.comparer, seed, after_step)
-
-
-def _counted(stage: str, total: int, watch: Progress) -> Callable[[], None]:
-    """Tells how many of so many are done."""
-    numbers = itertools.count(1)
-    return lambda: watch(stage, next(numbers), total, {})
+        return train_comparer(examples, self.comparer, seed, watch)
 
 
 def pretrain_grasping(

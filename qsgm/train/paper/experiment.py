@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from qsgm.progress import NO_FIGURES, Progress
+from qsgm.progress import NO_FIGURES, Progress, counted
 from qsgm.train.paper.objects import OBJECTS, ObjectCrops, cut_object
 from qsgm.train.paper.pretraining import PretrainingSizes, pretrain_without
 from qsgm.train.paper.systems import RATES, all_systems, tune_object
@@ -74,14 +74,9 @@ def _measure_object(
     seed: int,
     watch: Progress,
 ) -> dict[str, dict[str, Scores]]:
-    sizes, done = config.pretraining, 0
+    sizes = config.pretraining
     steps = sizes.network_steps + sizes.sgm_steps + sizes.four_layer_steps
-
-    def after_step() -> None:
-        nonlocal done
-        done += 1
-        watch("pretrain", done, steps)
-
+    after_step = counted(watch, "pretrain", steps)
     pretrained = pretrain_without(held_out, objects, sizes, seed, after_step)
     systems = all_systems(pretrained, seed)
     scores = {}

@@ -50,7 +50,7 @@ def record_examples(
 ) -> dict[int, Examples]:
     """Run backpropagation on every task and keep what each SGM would have seen."""
     layers = task.network.last(len(start))[:-1]
-    seen: dict[int, list[tuple[Tensor, ...]]] = {layer: [] for layer in layers}
+    seen: dict[int, list[Examples]] = {layer: [] for layer in layers}
     for chunk in tasks.chunks(8):
         states = start_states(start, len(chunk))
         batches = shuffled_batches(chunk.support, config.epochs, seed)
@@ -59,8 +59,9 @@ def record_examples(
             states, activations, gradients = backprop_step(states, features, labels, rates, task)
             if number % config.record_every == 0:
                 for layer in layers:
-                    seen[layer].append((activations[layer], labels, gradients[layer]))
-    return {layer: _stack(parts) for layer, parts in seen.items()}
+                    looks = activations[layer], labels, gradients[layer]
+                    seen[layer].append(Examples(*(one.flatten(0, 1) for one in looks)))
+    return {layer: joined(parts) for layer, parts in seen.items()}
 
 
 def fit_sgm(
@@ -108,8 +109,7 @@ def backprop_step(
     return states, activations, gradients
 
 
-def _stack(parts: list[tuple[Tensor, ...]]) -> Examples:
-    activations, labels, gradients = (
-        torch.cat([part[i].flatten(0, 1) for part in parts]) for i in range(3)
-    )
-    return Examples(activations, labels, gradients)
+def joined(parts: Sequence[Examples]) -> Examples:
+    """All of them in a row."""
+    names = ("activations", "labels", "gradients")
+    return Examples(*(torch.cat([getattr(one, name) for one in parts]) for name in names))

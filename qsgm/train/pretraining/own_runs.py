@@ -19,7 +19,7 @@ from qsgm.train.heads import error
 from qsgm.train.model.local import GradientOf, local_step, true_gradients
 from qsgm.train.model.sgm import Sgm
 from qsgm.train.pretraining.maml import apply_sgm
-from qsgm.train.pretraining.matching import Examples, MatchingConfig, fit_sgm
+from qsgm.train.pretraining.matching import Examples, MatchingConfig, fit_sgm, joined
 from qsgm.train.pretraining.rates import Start
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
@@ -69,7 +69,7 @@ def learn_along_own_runs(
         for layer, looks in looks_along(driving, start, some, rates, task, config, seed + number):
             seen[layer].append(looks)
         for layer, sgm in sgms.items():
-            fit_sgm(sgm, _joined(seen[layer]), config.fit, seed + number, after_step)
+            fit_sgm(sgm, joined(seen[layer]), config.fit, seed + number, after_step)
 
 
 @torch.no_grad()
@@ -119,9 +119,3 @@ def _look(activation: Tensor, labels: Tensor, true: Tensor, bound: Tensor) -> Ex
     """Samples (M, ...) of the tasks (T, B, ...) that are not lost."""
     kept = true.isfinite().all(dim=(1, 2, 3)) & (activation.abs().amax(dim=(1, 2, 3)) < bound)
     return Examples(*(one[kept].flatten(0, 1) for one in (activation, labels, true)))
-
-
-def _joined(parts: Sequence[Examples]) -> Examples:
-    """All of them in a row."""
-    names = ("activations", "labels", "gradients")
-    return Examples(*(torch.cat([getattr(one, name) for one in parts]) for name in names))

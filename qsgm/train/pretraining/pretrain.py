@@ -16,7 +16,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
@@ -32,7 +32,7 @@ from qsgm.blocks import Blocks, single_layers
 from qsgm.errors import QsgmError
 from qsgm.files import write_text_atomic
 from qsgm.manifest import Recipe
-from qsgm.progress import Progress
+from qsgm.progress import Progress, counted
 from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.grouping import usual_blocks
@@ -283,13 +283,7 @@ def _portable(net: ConvNet) -> ConvNet:
 def _draw(
     net: ConvNet, task: DrawnTask, count: int, samples: int, seed: int, watch: Progress, tuned: int
 ) -> TaskSet:
-    done = 0
-
-    def after_task() -> None:
-        nonlocal done
-        done += 1
-        watch("tasks", done, count, {})
-
+    after_task = counted(watch, "tasks", count)
     return draw_tasks(net, task, count, samples, seed, after_task, task.network.depth - tuned)
 
 
@@ -317,13 +311,7 @@ def _match(
     # All but the first hold still here: what its SGM regresses is then a function of its input.
     rates = (rate, *[0.0] * len(sgms))
     examples = record_examples(tasks, start, rates, task, config.matching, seed)
-    done, total = 0, len(sgms) * config.matching.fit_steps
-
-    def after_step() -> None:
-        nonlocal done
-        done += 1
-        watch("matching", done, total, {})
-
+    after_step = counted(watch, "matching", len(sgms) * config.matching.fit_steps)
     for layer, sgm in sgms.items():
         fit_sgm(sgm, examples[layer], config.matching, seed + layer, after_step)
     _refuse_unless_finite("matching", *sgms.values())
@@ -339,6 +327,11 @@ def _copied(sgms: dict[int, Sgm]) -> dict[int, dict[str, Tensor]]:
     }
 
 
+def _scored(tell: Callable[..., None]) -> AfterRun:
+    """Tells what comes of every run."""
+    return lambda score: tell({"objective": score.objective})
+
+
 def _first_rates(
     net: ConvNet,
     sgms: dict[int, Sgm],
@@ -350,13 +343,7 @@ def _first_rates(
     """Where meta-training starts."""
     if isinstance(config.first_rates, tuple):
         return config.first_rates
-    done, total = 0, len([*candidates(config.late)])
-
-    def after_run(score: Score) -> None:
-        nonlocal done
-        done += 1
-        watch("first rates", done, total, {"objective": score.objective})
-
+    after_run = _scored(counted(watch, "first rates", len([*candidates(config.late)])))
     rule = UpdateRule(sgms, FLAT, (), task)
     return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
 
@@ -373,23 +360,16 @@ def _match_on(
     watch: Progress,
 ) -> None:
     """Teach the SGMs, in place, along runs that they drive."""
-    if not config.own_runs.rounds:
+    sizes = config.own_runs
+    if not sizes.rounds:
         return
     if "own" in partial.data:
         for layer, sgm in sgms.items():
             sgm.load_state_dict(partial.data["own"][layer])
         return
-    done, total = 0, len(sgms) * config.own_runs.rounds * config.own_runs.fit.fit_steps
-
-    def after_step() -> None:
-        nonlocal done
-        done += 1
-        watch("own runs", done, total, {})
-
+    after_step = counted(watch, "own runs", len(sgms) * sizes.rounds * sizes.fit.fit_steps)
     start = folded_start(net, config.late)
-    learn_along_own_runs(
-        sgms, start, tasks, first_rates, task, config.own_runs, seed + 7, after_step
-    )
+    learn_along_own_runs(sgms, start, tasks, first_rates, task, sizes, seed + 7, after_step)
     _refuse_unless_finite("own runs", *sgms.values())
     partial.save(own=_copied(sgms))
 
@@ -447,12 +427,10 @@ def _match_early(
         for layer, sgm in training.sgms.items():
             sgm.load_state_dict(partial.data["early"][layer])
         return {layer: sgm.eval() for layer, sgm in training.sgms.items()}
-    done = 0
+    tell = counted(watch, "early", early.steps)
 
     def after_step(cosines: dict[int, float]) -> None:
-        nonlocal done
-        done += 1
-        watch("early", done, early.steps, {f"cos{layer}": c for layer, c in cosines.items()})
+        tell({f"cos{layer}": cosine for layer, cosine in cosines.items()})
 
     sgms = training.run(after_step)
     _refuse_unless_finite("early", *sgms.values())
@@ -471,7 +449,6 @@ def _choose_rates(
     """Rates of SGD for all numbers of layers and blocks, and how the late layers are tuned."""
     sizes, network, late = config.rates, task.network, len(rule.rates)
     tasks = _draw(net, task, sizes.tasks, sizes.crops_per_task, seed + 2, watch, late)
-    done = 0
     groups = _groups(rule, late) if config.grouped else []
     total = (
         late_runs(rule.rates)
@@ -479,12 +456,7 @@ def _choose_rates(
         else len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
     )
     total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
-
-    def after_run(score: Score) -> None:
-        nonlocal done
-        done += 1
-        watch("rates", done, total, {"objective": score.objective})
-
+    after_run = _scored(counted(watch, "rates", total))
     found = _late_rates(rule, folded_start(net, late), tasks, config, after_run)
     rates, rule = dict(found.rates), replace(rule, rates=found.rates[late])
     if late < network.depth:
