@@ -36,7 +36,7 @@ from qsgm.images import read_frame
 from qsgm.tune.plan import resolve
 
 RIGHT_SHARE = 0.27
-FALSE_ALARMS = 0.02
+FALSE_ALARMS = (0.005, 0.01, 0.02)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,6 @@ def table_of(answers: Sequence[Answer], refused: int, objects: int) -> Table:
     """What a reader wants to know of all answers."""
     present = [one for one in answers if one.present]
     absent = [one for one in answers if not one.present]
-    threshold = float(np.quantile([one.quality for one in absent], 1 - FALSE_ALARMS))
     turns = [one.turn_error_deg for one in present if one.found and one.turn_error_deg is not None]
     table = Table("", "", title=f"{objects} objects, {refused} of them refused")
     rows = {
@@ -125,14 +124,21 @@ def table_of(answers: Sequence[Answer], refused: int, objects: int) -> Table:
         "first guess in the right place": sum(one.right for one in present),
         "photographs without it": len(absent),
         "found though absent": sum(one.found for one in absent),
-        "right at 2 % found though absent": sum(
-            one.right and one.quality > threshold for one in present
-        ),
+        **{
+            f"right at {rate:.1%} found though absent": _right_at(rate, answers)
+            for rate in FALSE_ALARMS
+        },
         "median turn error": f"{np.median(turns):.1f} deg" if turns else "-",
     }
     for name, value in rows.items():
         table.add_row(name, str(value))
     return table
+
+
+def _right_at(rate: float, answers: Sequence[Answer]) -> int:
+    """How many are right where so many of the photographs without the object are taken for it."""
+    threshold = float(np.quantile([one.quality for one in answers if not one.present], 1 - rate))
+    return sum(one.present and one.right and one.quality > threshold for one in answers)
 
 
 def main() -> None:

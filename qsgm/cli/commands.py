@@ -26,6 +26,7 @@ from qsgm.cli.options import (
     CenterOption,
     CentersOption,
     Device,
+    DistanceOption,
     Encoding,
     EpochsOption,
     FrameArgument,
@@ -268,14 +269,7 @@ def predict(
     everything: Annotated[
         bool, typer.Option("--all", help="List every instance of the object.")
     ] = False,
-    any_distance: Annotated[
-        bool | None,
-        typer.Option(
-            "--any-distance/--same-distance",
-            help="Where it is not found, look at half to twice the distance, too.",
-            show_default="any, but with --all",
-        ),
-    ] = None,
+    any_distance: DistanceOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a picture here.")
     ] = None,

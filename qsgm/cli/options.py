@@ -117,10 +117,12 @@ ObjectsOption = Annotated[
         help="Tuned object, a folder or one of yours by name; repeatable; default: the last one.",
     ),
 ]
-AnyDistanceOption = Annotated[
-    bool,
+_FURTHER_LOOKS = "Where it is not found, look at half to twice the distance, too."
+AnyDistanceOption = Annotated[bool, typer.Option("--any-distance", help=_FURTHER_LOOKS)]
+DistanceOption = Annotated[
+    bool | None,
     typer.Option(
-        "--any-distance", help="Where it is not found, look at half to twice the distance, too."
+        "--any-distance/--same-distance", help=_FURTHER_LOOKS, show_default="any, but with --all"
     ),
 ]
 BundleOption = Annotated[
