@@ -27,7 +27,7 @@ demo: .venv/installed  ## fine-tune on one frame in int8, find the object in ano
 
 test: lint  ## lint, types and tests
 	.venv-test/bin/mypy
-	.venv-test/bin/python -m pytest
+	.venv-test/bin/python -m pytest --numprocesses auto --dist loadfile
 
 robustness: .venv-test/installed  ## fuzz, kill and starve it for long; counts at the end
 	QSGM_ROBUSTNESS=$(TIMES) .venv-test/bin/python -m pytest tests/robustness

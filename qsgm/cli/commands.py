@@ -133,6 +133,27 @@ def draw_calibration(
         tell("calibration set", output)
 
 
+@app.command("teach-comparer")
+def teach_comparer(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="SGM.PT", help="What `qsgm pretrain` wrote.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE")] = Path("comparer.json"),
+    seed: SeedOption = 0,
+    device: Annotated[Device, typer.Option(help="To learn on.")] = Device.CPU,
+    processes: Annotated[int, typer.Option(min=1, max=256, help="That draw.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Teach the network that tells the object from others on drawn ones (host; a GPU's work)."""
+    host = host_module("qsgm.train.grasp.teach_comparer")
+    with progress() as watch:
+        host.teach_comparer(checkpoint, output, seed, device.value, processes, watch)
+    if as_json:
+        print_json({"output": str(output), "seed": seed, "device": device.value})
+    else:
+        tell("comparer", output)
+
+
 @app.command("fold-and-quantize")
 def fold_and_quantize(
     checkpoint: Annotated[

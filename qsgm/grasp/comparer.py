@@ -9,6 +9,8 @@ its answer is one more piece of evidence. 27,000 weights of 8 bits.
 
 import base64
 import binascii
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -80,6 +82,10 @@ class Comparer:
             "scales": scales,
             "biases": biases,
         }
+
+    def digest(self) -> str:
+        """SHA-256 of its numbers."""
+        return hashlib.sha256(json.dumps(self.to_json()).encode()).hexdigest()
 
     @staticmethod
     def from_json(values: Mapping[str, Any], where: str) -> "Comparer":

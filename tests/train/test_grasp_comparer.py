@@ -1,6 +1,8 @@
 """The comparer learns what is alike; what it learns from is the object where it says so."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,34 +11,36 @@ import torch
 from numpy.typing import NDArray
 from toys import bump, lay, table, toy
 
+from qsgm.bundle import load_bundle
 from qsgm.grasp.cells import Cells
+from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.correlation import Template
+from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.patch import cut_patch
+from qsgm.grasp.task import GraspTask
+from qsgm.paths import bundle_folder
+from qsgm.task import task_record
+from qsgm.train.checkpoint import Checkpoint, save_checkpoint
 from qsgm.train.grasp.comparer import (
     Batch,
+    Batches,
+    Chance,
     ComparerConfig,
     ComparerNet,
-    Examples,
-    batch_of,
-    draw_examples,
+    shipped_comparer,
     train_comparer,
     varied,
 )
+from qsgm.train.grasp.comparer_examples import Examples, ExamplesConfig, draw_examples
 from qsgm.train.grasp.episodes import Episode, EpisodeMaker
+from qsgm.train.grasp.teach_comparer import teach_comparer
+from qsgm.train.model.net import ConvNet
+from qsgm.train.model.sgm import Sgm
 
 CENTER = (320.0, 240.0)
 CELLS = Cells.of(Template(cut_patch(lay(toy(), table(), CENTER), CENTER)))
-SMALL = ComparerConfig(
-    episodes=1,
-    scenes=3,
-    tables=2,
-    others=12,
-    channels=(6, 6, 6, 6),
-    hidden=8,
-    passes=30,
-    batch=16,
-    of_the_object=8,
-)
+FEW = ExamplesConfig(episodes=1, scenes=3, tables=2, others=12)
+SMALL = ComparerConfig((6, 6, 6, 6), hidden=8, steps=120, batch=16, of_the_object=8)
 
 
 def alike_or_not(count: int = 64) -> Examples:
@@ -79,8 +83,10 @@ def test_what_is_frozen_answers_as_what_was_learnt() -> None:
 
 def test_it_learns_to_tell_what_is_alike_from_what_is_not() -> None:
     examples, steps = alike_or_not(), list[tuple[int, int]]()
-    learnt = train_comparer(examples, SMALL, 0, lambda _, done, of, *__: steps.append((done, of)))
-    assert steps[-1][0] == steps[-1][1] == SMALL.passes * len(examples) // SMALL.batch
+    learnt = train_comparer(
+        examples, SMALL, 0, "cpu", lambda _, done, of, *__: steps.append((done, of))
+    )
+    assert steps[-1] == (SMALL.steps, SMALL.steps)
     taught, everywhere = examples.taught[0].astype(np.float32), np.ones((64, 64), np.float32)
     whole = replace(CELLS, image=taught, solid=everywhere)
     logits = learnt.logits(whole, examples.seen)
@@ -88,14 +94,15 @@ def test_it_learns_to_tell_what_is_alike_from_what_is_not() -> None:
 
 
 def test_varied_examples_keep_the_object_where_its_mask_is() -> None:
-    rng, examples = np.random.default_rng(0), alike_or_not(8)
+    chance, examples = Chance(torch.Generator().manual_seed(0)), alike_or_not(8)
     solid = np.zeros((1, 64, 64), np.uint8)
     solid[:, :20, :30] = 255
     bright = np.repeat(solid[..., None], 3, axis=3)
     lit = Examples(bright, solid, np.repeat(bright, 8, axis=0), examples.of, examples.mine)
+    batches = Batches(lit, SMALL, 0, "cpu")
     corners = set[int]()
     for _ in range(40):
-        batch: Batch = varied(batch_of(lit, np.arange(8)), rng)
+        batch: Batch = varied(batches.of(torch.arange(8)), chance)
         inside = batch.solid.expand_as(batch.taught) > 0.5
         (on,), (off,) = batch.taught[inside].unique(), batch.taught[~inside].unique()
         assert {float(on), float(off)} == {0.0, 255.0}
@@ -122,7 +129,7 @@ def test_another_thing_where_the_object_was_is_not_the_object(
         return replace(episode, scenes=(), without=tuple(there))
 
     monkeypatch.setattr(EpisodeMaker, "draw", without_alone)
-    config = replace(SMALL, scenes=8)
+    config = replace(FEW, scenes=8)
     examples = draw_examples(lambda frame: bump([places[id(frame)]]), config, 1, lambda: None)
     assert len(places) > 1
     assert len(examples) > len(places)
@@ -132,7 +139,7 @@ def test_another_thing_where_the_object_was_is_not_the_object(
 def test_examples_show_the_object_where_they_say_so() -> None:
     """A network that sees nothing proposes places anywhere; the true poses are there anyway."""
     told = list[int]()
-    examples = draw_examples(nowhere, SMALL, 3, lambda: told.append(1))
+    examples = draw_examples(nowhere, FEW, 3, lambda: told.append(1))
     assert len(told) == len(examples.taught) == 1
     assert examples.mine.any()
     assert not examples.mine.all()
@@ -140,3 +147,58 @@ def test_examples_show_the_object_where_they_say_so() -> None:
     away = np.abs(examples.seen - taught).mean(axis=3)
     off = (away * weight).sum(axis=(1, 2)) / weight.sum()
     assert np.median(off[examples.mine]) < np.median(off[~examples.mine])
+
+
+def test_a_batch_has_as_many_of_the_object_as_told_and_each_beside_its_own() -> None:
+    """Objects of one grey each: what is taught and seen agree where it is the object's."""
+    count = 40
+    levels = np.arange(count, dtype=np.uint8) * 6
+    taught = np.broadcast_to(levels[:, None, None, None], (count, 64, 64, 3)).copy()
+    examples = Examples(
+        taught,
+        np.full((count, 64, 64), 255, np.uint8),
+        taught,
+        np.arange(count),
+        np.arange(count) % 4 == 0,
+    )
+    batches = Batches(examples, SMALL, 0, "cpu")
+    batch = batches.of(torch.tensor([3, 8]))
+    assert batch.taught[:, 0, 0, 0].tolist() == batch.seen[:, 0, 0, 0].tolist() == [18.0, 48.0]
+    drawn = batches.draw()
+    assert len(drawn.seen) == len(batches.truth) == SMALL.batch
+    greys = {float(grey) for grey in drawn.taught[: SMALL.of_the_object, 0, 0, 0]}
+    of_objects = {6.0 * k for k in range(0, count, 4)}
+    assert greys <= of_objects or greys <= {255 - grey for grey in of_objects}
+    assert batches.truth.tolist() == [1.0] * 8 + [0.0] * 8
+
+
+def test_the_shipped_comparer_tells_a_thing_from_another_and_is_what_is_shipped() -> None:
+    comparer = shipped_comparer()
+    other = lay(toy(), np.ascontiguousarray(255 - table()), CENTER, 90)
+    seen = np.rint([CELLS.image, Cells.of(Template(cut_patch(other, CENTER))).image])
+    same, another = comparer.logits(CELLS, seen.astype(np.uint8))
+    assert same > 0 > another
+    decision = load_bundle(bundle_folder()).manifest.task.settings["decision"]
+    assert decision["comparer"] == comparer.to_json()
+
+
+def test_teach_comparer_writes_the_same_numbers_however_many_processes_draw(
+    tmp_path: Path,
+) -> None:
+    sgms, rates = {5: Sgm(GRASPNET, 5, (4,)).eval()}, {"6": (0.1,), "5,6": (0.1, 0.1)}
+    net = ConvNet(GRASPNET).eval()
+    untouched = Checkpoint(task_record(GraspTask()), net, sgms, {}, rates, {})
+    save_checkpoint(tmp_path / "sgm.pt", untouched)
+    taught = []
+    for processes in (1, 2):
+        stages = list[str]()
+        output = tmp_path / f"{processes}.json"
+        few, small = replace(FEW, episodes=2, scenes=1), replace(SMALL, steps=2)
+
+        def watch(stage: str, *_: object, stages: list[str] = stages) -> None:
+            stages.append(stage)
+
+        teach_comparer(tmp_path / "sgm.pt", output, 0, "cpu", processes, watch, few, small)
+        assert stages == ["examples"] * 2 + ["comparer"] * 2
+        taught.append(Comparer.from_json(json.loads(output.read_text()), "it").digest())
+    assert taught[0] == taught[1] != shipped_comparer().digest()

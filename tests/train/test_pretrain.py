@@ -15,7 +15,7 @@ from qsgm.errors import QsgmError
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import grasp_task
 from qsgm.train.checkpoint import load_checkpoint
-from qsgm.train.grasp.comparer import ComparerConfig
+from qsgm.train.grasp.comparer import shipped_comparer
 from qsgm.train.grasp.decision import DecisionConfig
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig
 from qsgm.train.grasp.pretrain import DecisionStage, pretrain_grasping
@@ -60,17 +60,7 @@ TINY = PretrainConfig(
 TASK = DrawnGrasping()
 LAST = DecisionStage(
     TASK,
-    ComparerConfig(
-        episodes=2,
-        scenes=2,
-        tables=2,
-        others=12,
-        channels=(4, 4, 4, 4),
-        hidden=4,
-        passes=1,
-        batch=8,
-        of_the_object=3,
-    ),
+    shipped_comparer(),
     DecisionScenesConfig(episodes=2, scenes=2, tables=2, others=12, crops=20, support=16, epochs=1),
     DecisionConfig(hidden=4, steps=5, folds=2),
 )
@@ -105,8 +95,6 @@ def test_pretraining_ends_in_a_checkpoint_that_loads_and_says_how_it_was_made(
         "meta",
         "early",
         "rates",
-        "examples",
-        "comparer",
         "decision",
     ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.md", "sgm.pt"]
@@ -355,7 +343,7 @@ def test_stages_after_the_backbone_run_on_one_thread_and_then_as_before(tmp_path
         after_interruption = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
-    late = ("tasks", "matching", "meta", "early", "rates", "examples", "comparer", "decision")
+    late = ("tasks", "matching", "meta", "early", "rates", "decision")
     assert threads == {"backbone": 2} | dict.fromkeys(late, 1)
     assert (after, after_interruption) == (2, 2)
 

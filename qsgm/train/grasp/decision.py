@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
-from qsgm.train.grasp.comparer import OFF_OBJECT_PX, ON_OBJECT_PX
+from qsgm.train.grasp.comparer_examples import OFF_OBJECT_PX, ON_OBJECT_PX
 
 Floats = NDArray[np.float32]
 

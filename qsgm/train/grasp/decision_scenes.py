@@ -15,7 +15,7 @@ from qsgm.grasp.decision import with_comparison
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import cut_patch
 from qsgm.task import Heads
-from qsgm.train.grasp.comparer import Look
+from qsgm.train.grasp.comparer_examples import Look
 from qsgm.train.grasp.decision import JudgedScene, Weighed
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker

@@ -1,31 +1,23 @@
 """`qsgm pretrain`: the grasping task from nothing to `sgm.pt`.
 
-The five stages of :mod:`qsgm.train.pretraining.pretrain`, and a sixth, on whole drawn scenes: a
-network that compares a candidate with the taught object, and how all evidence for and against it is
-weighed.
+The five stages of :mod:`qsgm.train.pretraining.pretrain`, and a sixth, on whole drawn scenes: how
+all evidence for and against a candidate is weighed.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.task import GraspTask
 from qsgm.progress import Progress, counted
 from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.grasp.comparer import ComparerConfig, draw_examples, train_comparer
+from qsgm.train.grasp.comparer import shipped_comparer
 from qsgm.train.grasp.decision import DecisionConfig, fit_decision
-from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, heatmap_of, judged_scenes
+from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
 from qsgm.train.grasp.task import DrawnGrasping
 from qsgm.train.model.fold import folded_start
 from qsgm.train.pretraining.pretrain import Learnt, PretrainConfig, pretrain
-from qsgm.train.pretraining.tasks import start_states
-
-Start = Sequence[tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -33,28 +25,23 @@ class DecisionStage:
     """The sixth stage."""
 
     task: GraspTask
-    comparer: ComparerConfig = field(default_factory=ComparerConfig)
+    comparer: Comparer = field(default_factory=shipped_comparer)
     scenes: DecisionScenesConfig = field(default_factory=DecisionScenesConfig)
     decision: DecisionConfig = field(default_factory=DecisionConfig)
 
     def to_json(self) -> dict[str, Any]:
-        return {name: asdict(getattr(self, name)) for name in ("comparer", "scenes", "decision")}
+        return {name: asdict(getattr(self, name)) for name in ("scenes", "decision")} | {
+            "comparer": self.comparer.digest()
+        }
 
     def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> GraspTask:
         start = folded_start(learnt.net, len(learnt.rule.rates))
-        comparer = self._comparer(learnt, start, seed + 11, watch)
         count = counted(watch, "decision", self.scenes.episodes)
         judged = judged_scenes(
-            learnt.net, learnt.rule, start, comparer, self.scenes, seed + 7, count
+            learnt.net, learnt.rule, start, self.comparer, self.scenes, seed + 7, count
         )
-        return replace(self.task, decision=fit_decision(judged, self.decision, seed, comparer))
-
-    def _comparer(self, learnt: Learnt, start: Start, seed: int, watch: Progress) -> Comparer:
-        states = start_states(start, 1)
-        look = partial(heatmap_of, learnt.net, states, heads=self.task.heads)
-        count = counted(watch, "examples", self.comparer.episodes)
-        examples = draw_examples(look, self.comparer, seed, count)
-        return train_comparer(examples, self.comparer, seed, watch)
+        decision = fit_decision(judged, self.decision, seed, self.comparer)
+        return replace(self.task, decision=decision)
 
 
 def pretrain_grasping(

@@ -158,7 +158,7 @@ def pretrain(
             weights are not finite, or fine-tuning fails at every rate. Then no `output` is written.
     """
     config = config or PretrainConfig()
-    _check_device(device)
+    check_device(device)
     _check_output(output)
     extra = {} if last_stage is None else last_stage.to_json()
     identity = _identity(task, seed, device, config, extra)
@@ -502,7 +502,8 @@ def _groups(rule: UpdateRule, late: int) -> list[Blocks]:
     ]
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Refuse a device that is not there."""
     if device == "cuda" and not torch.cuda.is_available():
         raise QsgmError("--device cuda: torch sees no CUDA device here; use --device cpu")
 

@@ -1,0 +1,66 @@
+"""`qsgm teach-comparer`: a comparer, from drawn objects that an untouched network looks for."""
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+
+from qsgm.files import new_file
+from qsgm.grasp.task import grasp_task
+from qsgm.progress import Progress, counted
+from qsgm.train.checkpoint import load_checkpoint
+from qsgm.train.grasp.comparer import ComparerConfig, train_comparer
+from qsgm.train.grasp.comparer_examples import ExamplesConfig, Look, draw_examples
+from qsgm.train.grasp.decision_scenes import heatmap_of
+from qsgm.train.model.fold import folded_start
+from qsgm.train.pretraining.pretrain import check_device
+from qsgm.train.pretraining.tasks import start_states
+
+_TUNED = 3  # the layers whose start is meta-trained
+
+
+def teach_comparer(
+    checkpoint_path: Path,
+    output: Path,
+    seed: int,
+    device: str,
+    processes: int,
+    watch: Progress,
+    drawn: ExamplesConfig = ExamplesConfig(),  # noqa: B008 (it is frozen)
+    config: ComparerConfig = ComparerConfig(),  # noqa: B008
+) -> None:
+    """Draw examples, learn from them, and write what :func:`shipped_comparer` reads.
+
+    Args:
+        checkpoint_path: `sgm.pt`.
+        output: a JSON file.
+        seed: of everything random.
+        device: `cpu` or `cuda`, to learn on.
+        processes: that draw, one core each; how many they are changes no example.
+        watch: told about progress.
+        drawn: how many examples.
+        config: the comparer's sizes and rates.
+
+    Raises:
+        QsgmError: as :func:`load_checkpoint`, it is another task's checkpoint, the device is not
+            there, or `output` cannot be written.
+    """
+    check_device(device)
+    look = _untouched(checkpoint_path)
+    with new_file(output) as new:
+        count = counted(watch, "examples", drawn.episodes)
+        spawned, one_thread = get_context("spawn"), (torch.set_num_threads, (1,))
+        with ProcessPoolExecutor(processes, spawned, *one_thread) as pool:
+            examples = draw_examples(look, drawn, seed, count, pool.map)
+        comparer = train_comparer(examples, config, seed, device, watch)
+        new.write_text(json.dumps(comparer.to_json()) + "\n", encoding="ascii")
+
+
+def _untouched(checkpoint_path: Path) -> Look:
+    checkpoint = load_checkpoint(checkpoint_path)
+    task = grasp_task(checkpoint.task, str(checkpoint_path))
+    states = start_states(folded_start(checkpoint.net, _TUNED), 1)
+    return partial(heatmap_of, checkpoint.net, states, heads=task.heads)
