@@ -16,7 +16,7 @@ def test_host_commands_say_what_to_install_when_torch_is_missing(
         raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
 
     monkeypatch.setattr(console, "importlib", SimpleNamespace(import_module=without_torch))
-    for command in (("pretrain",), ("fold-and-quantize", "sgm.pt")):
+    for command in (("pretrain",), ("teach-comparer", "sgm.pt"), ("fold-and-quantize", "sgm.pt")):
         assert_refused(
             qsgm(*command), 1, "needs torch", "pip install -c constraints.txt '.[train]'"
         )
@@ -48,6 +48,28 @@ def test_pretrain_passes_on_encoding_and_hidden_channels(
     assert task.encoding == "double"
     assert other_config.hidden == (16, 8)
     assert other_task.encoding == "paper"
+
+
+def test_teach_comparer_passes_on_where_it_draws_and_learns(
+    qsgm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from qsgm.train.grasp import teach_comparer
+
+    given = []
+    monkeypatch.setattr(teach_comparer, "teach_comparer", lambda *values: given.append(values[:5]))
+    output = tmp_path / "comparer.json"
+    outcome = qsgm("teach-comparer", "my.pt", "-o", output, "--processes", 3, "--seed", 2, "--json")
+    assert outcome.json == {"output": str(output), "seed": 2, "device": "cpu"}
+    assert given == [(Path("my.pt"), output, 2, "cpu", 3)]
+
+
+def test_teach_comparer_refuses_what_is_no_checkpoint_and_leaves_nothing(
+    qsgm: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "sgm.pt").write_text("not one")
+    output = tmp_path / "comparer.json"
+    assert_refused(qsgm("teach-comparer", tmp_path / "sgm.pt", "-o", output), 1, "sgm.pt")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["sgm.pt"]
 
 
 @pytest.mark.parametrize("hidden", ["", "a", "8,", "0", "-4,4", "8;8", "99999"])
