@@ -67,14 +67,14 @@ class TunedMethod:
     recipe: Recipe | None = None  # optimizer and rates; None: the bundle's
 
     def answers(self, subject: Subject, scenes: Sequence[Frame]) -> list[Answer]:
-        """Tune on the subject's demonstration and locate it in every scene."""
+        """Tune on the subject's demonstration and look in every scene as `qsgm predict` does."""
         plan = resolve(self.settings, self.bundle, self.recipe)
         prepared = prepare_object(subject.frame, self.bundle, plan)
         tuned = train_object(prepared, plan).tuned_object(subject.name)
         answers = []
         for scene in scenes:
             began = time.perf_counter()
-            detection, _ = tuned.locate(scene)
+            detection, _ = tuned.locate_at_any_distance(scene)
             answers.append(_answer(detection, time.perf_counter() - began))
         return answers
 

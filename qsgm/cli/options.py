@@ -117,7 +117,7 @@ ObjectsOption = Annotated[
         help="Tuned object, a folder or one of yours by name; repeatable; default: the last one.",
     ),
 ]
-_FURTHER_LOOKS = "Where it is not found, look at half to twice the distance, too."
+_FURTHER_LOOKS = "Where it is not found, look more closely and at half to twice the distance, too."
 AnyDistanceOption = Annotated[bool, typer.Option("--any-distance", help=_FURTHER_LOOKS)]
 DistanceOption = Annotated[
     bool | None,

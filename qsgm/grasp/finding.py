@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qsgm.grasp.angles import full_degrees, wrap_half_turn
 from qsgm.grasp.correlation import Fit
 from qsgm.grasp.decision import Decision
-from qsgm.grasp.judge import JUDGED, Appearance, best_fit, judge
+from qsgm.grasp.judge import QUICK, Appearance, Effort, best_fit, judge
 from qsgm.grasp.shown import View
 
 Frame = NDArray[np.uint8]
@@ -87,7 +87,11 @@ class Finder:
         return tuple(Appearance.of(view.patch) for view in self.views)
 
     def find(
-        self, frame: Frame, heatmap: NDArray[np.float32], decision: Decision, count: int = JUDGED
+        self,
+        frame: Frame,
+        heatmap: NDArray[np.float32],
+        decision: Decision,
+        effort: Effort = QUICK,
     ) -> list[Sighting]:
         """The best places, best first, no two of the same object; at least one.
 
@@ -95,11 +99,11 @@ class Finder:
             frame: (H, W, 3) BGR at the object's scale.
             heatmap: (3, rows, cols) of that frame.
             decision: how sure a place is.
-            count: how many to judge for every view.
+            effort: how many ways to follow, for every view.
         """
         sightings = []
         for view, appearance in zip(self.views, self.appearances, strict=True):
-            found = judge(appearance, frame, heatmap, count)
+            found = judge(appearance, frame, heatmap, effort)
             evidence = np.stack([one.evidence for one in found])
             seen = np.stack([one.seen for one in found])
             judged = decision.judged(appearance.reference.cells, evidence, seen)

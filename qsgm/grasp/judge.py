@@ -30,18 +30,42 @@ from qsgm.grasp.patch import PATCH_PX, Patch
 from qsgm.grasp.snapping import Snapper
 
 CELL_PX = 16
-# Cells of the heatmap that the patch is laid over, and how many places are judged.
-PROPOSED, JUDGED = 12, 4
-# For each of these, so many poses are looked at closer, and so many are aligned.
-_CLOSER, _ALIGNED = 2.5, 1.5
-# Of these at most so many are moved to their edges.
-_SNAPPED = 2
+# A look proposes at least so many cells.
+PROPOSED = 12
+# Where every turn is tried, so many are.
+_TURNS = 12
 # What the network's log odds count beside a correlation when poses are chosen.
 _QUALITY_WEIGHT = 0.02
 # Poses closer than that [px, rad] are the same one, by coarse looks and by closer ones.
 _SAME_POSE = (20.0, math.radians(25)), (10.0, math.radians(17))
 # Closer than that, two candidates are the same place.
 _SAME_PX = 24.0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many of the ways in which an object may lie a look follows."""
+
+    proposed: int  # cells of the heatmap that the patch is laid over
+    turned: int  # the first of them, in which every turn is tried
+    closer: int  # poses that are looked at closer
+    aligned: int
+    snapped: int  # at most, of these, moved to their edges
+    judged: int
+    apart_px: float  # between what is judged
+
+    @staticmethod
+    def for_places(count: int) -> "Effort":
+        """A quick look that judges up to so many places."""
+        closer, aligned = round(2.5 * count), round(1.5 * count)
+        return Effort(max(PROPOSED, 2 * count), 0, closer, aligned, 2, count, _SAME_PX)
+
+
+QUICK = Effort.for_places(4)
+# Most of what a quick look misses was laid wrongly: a part of it hidden, or other things beside it.
+# All poses of a place are judged: the firmest one may be the wrong one.
+THOROUGH = Effort(24, 4, 40, 20, 4, 20, apart_px=0.0)
+
 # Where a pose fits so well, the object is there, and no other place is looked at closer by edges.
 _FITS_WELL = 0.8
 # What alignment by pixels has to gain over the pose that edges gave.
@@ -128,7 +152,7 @@ def judge(
     appearance: Appearance,
     frame: NDArray[np.uint8],
     heatmap: NDArray[np.float32],
-    count: int = JUDGED,
+    effort: Effort = QUICK,
 ) -> list[Candidate]:
     """The most promising candidates of a frame.
 
@@ -136,10 +160,10 @@ def judge(
         appearance: of the taught object.
         frame: (H, W, 3) BGR.
         heatmap: (3, rows, cols) of that frame.
-        count: how many to judge at most.
+        effort: how many to follow.
     """
     scene, template = pyramid_of(frame), appearance.template
-    cells = candidate_cells(heatmap[0], max(PROPOSED, 2 * count))
+    cells = candidate_cells(heatmap[0], effort.proposed)
     fits = coarse_fits(template, scene, [cell_center(cell) for cell in cells])
     coarse, close = _SAME_POSE
     poses = [
@@ -147,12 +171,12 @@ def judge(
         for cell, some in zip(cells, fits, strict=True)
         for fit in some
     ]
-    some = [
-        _closer(template, scene, one) for one in _different(poses, round(_CLOSER * count), *coarse)
-    ]
-    few = _different(some, round(_ALIGNED * count), *close)
-    laid = _all_aligned(appearance, scene, few)
-    return [_candidate(appearance, scene, one, laid) for one in _apart(appearance, laid, count)]
+    starts = _different(poses, effort.closer, *coarse)
+    starts += [turned for cell in cells[: effort.turned] for turned in _turned(heatmap, cell)]
+    some = [_closer(template, scene, one) for one in starts]
+    laid = _all_aligned(appearance, scene, _different(some, effort.aligned, *close), effort.snapped)
+    kept = _apart(appearance, laid, effort)
+    return [_candidate(appearance, scene, one, laid) for one in kept]
 
 
 def best_fit(
@@ -166,7 +190,7 @@ def best_fit(
     scene = pyramid_of(frame)
     (fits,) = coarse_fits(appearance.template, scene, [near_px])
     poses = [_closer(appearance.template, scene, _Pose(fit, (0, 0), 0.5)) for fit in fits]
-    laid = _all_aligned(appearance, scene, poses)
+    laid = _all_aligned(appearance, scene, poses, QUICK.snapped)
     best = max(laid, key=lambda one: one.firmness)
     better, lead = _better_way_round(appearance, scene, best, laid)
     return better.fit, lead
@@ -178,17 +202,26 @@ def cell_center(cell: tuple[int, int]) -> tuple[float, float]:
     return float(HALF_CROP_PX + CELL_PX * col), float(HALF_CROP_PX + CELL_PX * row)
 
 
+def _turned(heatmap: NDArray[np.float32], cell: tuple[int, int]) -> list[_Pose]:
+    """The object in the middle of a cell's window, turned in every way."""
+    quality, middle = float(heatmap[0][cell]), cell_center(cell)
+    turns = (2 * math.pi * k / _TURNS for k in range(_TURNS))
+    return [_Pose(Fit(0.0, turn, 1.0, middle), cell, quality) for turn in turns]
+
+
 def _closer(template: Template, scene: Pyramid, pose: _Pose) -> _Pose:
     return replace(pose, fit=middle_fit(template, scene, pose.fit))
 
 
-def _all_aligned(appearance: Appearance, scene: Pyramid, poses: Sequence[_Pose]) -> list[_Laid]:
+def _all_aligned(
+    appearance: Appearance, scene: Pyramid, poses: Sequence[_Pose], snapped: int
+) -> list[_Laid]:
     """Poses aligned by pixels; the firmest few by edges, too, if none fits well."""
     laid = [_aligned(appearance, scene, pose, pose.fit) for pose in poses]
     laid.sort(key=lambda one: -one.firmness)
     if max(one.fit.score for one in laid) >= _FITS_WELL:
         return laid
-    return [_by_edges(appearance, scene, one) for one in laid[:_SNAPPED]] + laid[_SNAPPED:]
+    return [_by_edges(appearance, scene, one) for one in laid[:snapped]] + laid[snapped:]
 
 
 def _aligned(appearance: Appearance, scene: Pyramid, pose: _Pose, start: Fit) -> _Laid:
@@ -274,13 +307,14 @@ def _nearly_same(one: Fit, other: Fit, near_px: float, near_rad: float) -> bool:
     return math.cos(one.turn_rad - other.turn_rad) > math.cos(near_rad)
 
 
-def _apart(appearance: Appearance, laid: Sequence[_Laid], count: int) -> list[_Laid]:
-    """The `count` firmest, no two of the same place."""
+def _apart(appearance: Appearance, laid: Sequence[_Laid], effort: Effort) -> list[_Laid]:
+    """The firmest, no two of them closer than they may be."""
     kept: list[_Laid] = []
     for one in sorted(laid, key=lambda one: -one.firmness):
         center = appearance.center_of(one.fit)
-        if all(math.dist(center, appearance.center_of(other.fit)) > _SAME_PX for other in kept):
+        others = (appearance.center_of(other.fit) for other in kept)
+        if not any(math.dist(center, other) < effort.apart_px for other in others):
             kept.append(one)
-        if len(kept) == count:
+        if len(kept) == effort.judged:
             break
     return kept

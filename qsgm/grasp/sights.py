@@ -72,7 +72,8 @@ def look_for(
         tuned: the object.
         frame: where to look.
         everything: list every instance.
-        any_distance: where it is not found, look at half to twice the distance, too.
+        any_distance: where it is not found, look more closely and at half to twice the
+            distance, too.
     """
     look = tuned.locate_at_any_distance if any_distance else tuned.locate
     detection, heatmap = look(frame)

@@ -23,7 +23,7 @@ from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
 from qsgm.grasp.finding import MOST_INSTANCES, Finder, Sighting
 from qsgm.grasp.heatmap import CELL_PX, Detection, locate, refine
-from qsgm.grasp.judge import JUDGED, cell_center
+from qsgm.grasp.judge import QUICK, THOROUGH, Effort, cell_center
 from qsgm.grasp.measuring import MOST_ENLARGED, moved_point, scaled_frame, scaled_shape
 from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.others import Other
@@ -53,10 +53,10 @@ STRONG_CORRELATION = 0.7
 # on objects that lie close to it.
 MARGIN_PX = 48
 _LEAST_SIDE_PX = 64
-# Where that is asked for, an object is looked for as if it were so many times as large, too. Four
-# more looks are four more occasions to be wrong: there a place has to be surer.
+# Where that is asked for, an object that is not found is looked for more closely, and as if it were
+# so many times as large. More looks are more occasions to be wrong: a place has to be surer there.
 OTHER_SIZES = (0.5, 0.7, 1.4, 2.0)
-SURE_AT_OTHER_SIZES = 0.9
+SURE_MORE_CLOSELY, SURE_AT_OTHER_SIZES = 0.7, 0.9
 # The network sees larger frames strip by strip: 60 MB are enough then, whatever their size. Up to
 # half as large ones (a camera's 640x480) leave ONNX Runtime's memory to the next frame.
 _STRIP_PIXELS = 1 << 20
@@ -136,23 +136,27 @@ class TunedObject:
         """
         seen = self._seen(frame)
         heatmap = self.heatmap(seen)
-        found = self._detections(seen, heatmap, JUDGED)
-        places = tuple(self._in_frame(self._refined(one, seen), frame) for one in found)
-        return replace(places[0], candidates=places), heatmap
+        return self._best(frame, seen, heatmap, QUICK), heatmap
 
     def locate_at_any_distance(
         self, frame: NDArray[np.uint8]
     ) -> tuple[Detection, NDArray[np.float32]]:
-        """As :meth:`locate`; where nothing is found, from half to twice the distance as well."""
-        first = self.locate(frame)
-        if first[0].found:
-            return first
-        looks = [other.locate(frame) for other in self._at_other_sizes(frame)]
-        best, heatmap = max(looks, key=lambda look: look[0].quality, default=first)
-        if best.quality < SURE_AT_OTHER_SIZES:
-            return first
-        sure = (replace(p, found=p.quality >= SURE_AT_OTHER_SIZES) for p in best.candidates)
-        return replace(best, candidates=tuple(sure)), heatmap
+        """As :meth:`locate`; where nothing is found, more closely, and from other distances.
+
+        That is half to twice the demonstration's.
+        """
+        seen = self._seen(frame)
+        heatmap = self.heatmap(seen)
+        first = self._best(frame, seen, heatmap, QUICK)
+        if first.found:
+            return first, heatmap
+        closely = self._best(frame, seen, heatmap, THOROUGH)
+        looks = [(_surely(closely, SURE_MORE_CLOSELY), heatmap)]
+        for other in self._at_other_sizes(frame):
+            there, its_heatmap = other.locate(frame)
+            looks.append((_surely(there, SURE_AT_OTHER_SIZES), its_heatmap))
+        found = [look for look in looks if look[0].found]
+        return max(found, key=lambda look: look[0].quality, default=(first, heatmap))
 
     def _at_other_sizes(self, frame: NDArray[np.uint8]) -> Iterator["TunedObject"]:
         """The same object as if it were larger or smaller, where the frame can be searched so."""
@@ -168,7 +172,7 @@ class TunedObject:
     def locate_all(self, frame: NDArray[np.uint8]) -> list[Detection]:
         """Every instance of the object in a frame (H, W, 3), the surest first."""
         seen = self._seen(frame)
-        found = self._detections(seen, self.heatmap(seen), MOST_INSTANCES)
+        found = self._detections(seen, self.heatmap(seen), Effort.for_places(MOST_INSTANCES))
         refined = [self._refined(one, seen) for one in found if one.found]
         return [self._in_frame(one, frame) for one in refined]
 
@@ -225,15 +229,27 @@ class TunedObject:
         seen = cv2.copyMakeBorder(scaled, margin, margin, margin, margin, how)
         return np.asarray(seen, dtype=np.uint8)
 
+    def _best(
+        self,
+        frame: NDArray[np.uint8],
+        seen: NDArray[np.uint8],
+        heatmap: NDArray[np.float32],
+        effort: Effort,
+    ) -> Detection:
+        """The best place, and all candidates, in the frame's own pixels."""
+        found = self._detections(seen, heatmap, effort)
+        places = tuple(self._in_frame(self._refined(one, seen), frame) for one in found)
+        return replace(places[0], candidates=places)
+
     def _detections(
-        self, seen: NDArray[np.uint8], heatmap: NDArray[np.float32], count: int
+        self, seen: NDArray[np.uint8], heatmap: NDArray[np.float32], effort: Effort
     ) -> list[Detection]:
         """The best places first, at least one, none of them refined by the network yet."""
         coarse = self._at(heatmap, seen)
         decision = self.description.decision
         if self._finder is None or decision is None:
-            return [coarse, *self._further(coarse, seen, heatmap, count)]
-        sightings = self._finder.find(seen, heatmap, decision, count)
+            return [coarse, *self._further(coarse, seen, heatmap, effort.judged)]
+        sightings = self._finder.find(seen, heatmap, decision, effort)
         return [_as_detection(one) for one in sightings]
 
     def _further(
@@ -435,6 +451,12 @@ def _is_of(heatmap: NDArray[np.float32], frame: NDArray[np.uint8]) -> bool:
         return False
     inside = (1 + (side - CROP_PX) // CELL_PX for side in frame.shape[:2])
     return all(n in (few, few + 1) for n, few in zip(heatmap.shape[1:], inside, strict=True))
+
+
+def _surely(place: Detection, least: float) -> Detection:
+    """A place, found only where it is as sure as that."""
+    candidates = tuple(replace(one, found=one.quality >= least) for one in place.candidates)
+    return replace(place, found=place.quality >= least, candidates=candidates)
 
 
 def _as_detection(sighting: Sighting) -> Detection:

@@ -94,7 +94,8 @@ def watch(
         objects: to look for.
         every: look at one frame in so many.
         limit: at so many frames at most.
-        any_distance: where one is not found, look at half to twice the distance, too.
+        any_distance: where one is not found, look more closely and at half to twice the
+            distance, too.
 
     Raises:
         QsgmError: there is no such source, or a frame cannot be used.

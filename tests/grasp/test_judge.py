@@ -13,7 +13,16 @@ from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.correlation import Fit, coarse_fits, middle_fit, pyramid_of
 from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.finding import Sighting, confidence_of
-from qsgm.grasp.judge import JUDGED, PROPOSED, Appearance, _opposite, cell_center, judge
+from qsgm.grasp.judge import (
+    PROPOSED,
+    QUICK,
+    THOROUGH,
+    Appearance,
+    Effort,
+    _opposite,
+    cell_center,
+    judge,
+)
 from qsgm.grasp.patch import Patch, cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import _around, _as_detection
@@ -61,8 +70,8 @@ def test_as_many_places_are_judged_as_are_asked_for(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(judging, "candidate_cells", counted)
     places = [(100.0 + 110 * i, 100.0 + 110 * j) for i in range(5) for j in range(3)]
-    many = judge(APPEARANCE, table(1), bump(places), count=len(places))
-    few = judge(APPEARANCE, table(1), bump(places), count=2)
+    many = judge(APPEARANCE, table(1), bump(places), Effort.for_places(len(places)))
+    few = judge(APPEARANCE, table(1), bump(places), Effort.for_places(2))
     assert asked == [2 * len(places), PROPOSED]
     assert len(few) <= 2 < len(many) <= len(places)
 
@@ -78,7 +87,7 @@ def test_the_object_is_judged_first_though_the_network_likes_others_better() -> 
     heatmap = bump([(450.0, 300.0), (500.0, 120.0)], angle_rad=math.radians(turn))
     heatmap[0] = np.maximum(heatmap[0], 0.3 * bump([place])[0])
     found = judge(APPEARANCE, scene, heatmap)
-    assert 1 < len(found) <= JUDGED
+    assert 1 < len(found) <= QUICK.judged
     best = found[0]
     assert math.dist(best.center_px, place) < 0.5
     assert math.dist(best.cell_px, place) < 12
@@ -123,6 +132,34 @@ def test_edges_tell_the_way_round_of_a_plain_object_that_is_partly_hidden(seed: 
     off, turned = off_and_turned(scene, place, turn)
     assert off < 2
     assert turned < 2
+
+
+def laid_right(seed: int, effort: Effort) -> bool:
+    """Whether a toy under two blocks of any colour is judged as it lies, the network 12 px off."""
+    rng = np.random.default_rng(seed)
+    place = float(rng.uniform(150, 480)), float(rng.uniform(130, 350))
+    turn = float(rng.uniform(-180, 180))
+    scene = lay(toy(), table(seed + 1, grey=float(rng.choice([60, 100, 150]))), place, turn)
+    right, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    for _ in range(2):
+        along, half = rng.uniform(-30, 30), int(rng.integers(14, 22))
+        x, y = round(place[0] + along * right), round(place[1] - along * up)
+        scene[y - half : y + half, x - half : x + half] = rng.integers(0, 255, 3)
+    seen = place[0] + float(rng.uniform(-12, 12)), place[1] + float(rng.uniform(-12, 12))
+    return any(
+        math.dist(one.center_px, place) < 6
+        and math.cos(one.fit.turn_rad - math.radians(turn)) > math.cos(math.radians(8))
+        for one in judge(APPEARANCE, scene, bump([seen]), effort)
+    )
+
+
+def test_a_thorough_look_lays_right_what_a_quick_one_lays_wrong() -> None:
+    """Of 20 scenes of a half hidden object quick looks lay 12 right, thorough ones 18."""
+    quick, thorough = (
+        np.array([laid_right(seed, effort) for seed in range(20)]) for effort in (QUICK, THOROUGH)
+    )
+    assert thorough.sum() >= quick.sum() + 4
+    assert (quick & ~thorough).sum() <= 1
 
 
 def test_judging_again_gives_the_same_numbers() -> None:

@@ -18,11 +18,14 @@ from qsgm import QsgmError, load_object, tuned_folder
 from qsgm.bundle import Bundle
 from qsgm.grasp import tuned as tuned_module
 from qsgm.grasp.decision import Decision
+from qsgm.grasp.finding import Finder, Sighting
 from qsgm.grasp.heatmap import Detection, locate, refine
+from qsgm.grasp.judge import QUICK, THOROUGH, Effort
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import (
     MARGIN_PX,
+    OTHER_SIZES,
     ObjectDescription,
     TunedObject,
     save_object,
@@ -31,6 +34,8 @@ from qsgm.manifest import NETWORK
 from qsgm.tuned_folder import DESCRIPTION, REPORT
 
 Point = tuple[float, float]
+Frame = NDArray[np.uint8]
+Heatmap = NDArray[np.float32]
 MUG = ObjectDescription("mug", "double", 0.25)
 
 
@@ -345,6 +350,32 @@ def test_an_object_at_another_distance_is_found_where_that_is_asked_for(
     assert found.scale == 1 / size
     assert heatmap.shape != told.locate(scene)[1].shape
     assert told.description.scale == 1
+
+
+@pytest.mark.parametrize(("sure", "is_found"), [(0.69, False), (0.71, True)])
+def test_what_a_quick_look_leaves_open_a_thorough_one_decides_but_has_to_be_surer(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch, sure: float, is_found: bool
+) -> None:
+    """The same heatmap is looked at again before the frame is, at other sizes."""
+    efforts, find = list[Effort](), Finder.find
+
+    def as_told(
+        self: Finder, frame: Frame, heatmap: Heatmap, decision: Decision, effort: Effort = QUICK
+    ) -> list[Sighting]:
+        efforts.append(effort)
+        found = find(self, frame, heatmap, decision, QUICK)
+        return [replace(one, quality=sure if effort == THOROUGH else 0.4) for one in found]
+
+    monkeypatch.setattr(Finder, "find", as_told)
+    told = Told(bundle, described(), (300.0, 200.0))
+    assert not told.locate(table(3))[0].found
+    efforts.clear()
+    found, _ = told.locate_at_any_distance(table(3))
+    assert efforts == [QUICK, THOROUGH, *[QUICK] * len(OTHER_SIZES)]
+    assert found.found is is_found
+    assert found.quality == (sure if is_found else 0.4)
+    assert found.scale == 1
+    assert all(one.found is is_found for one in found.candidates)
 
 
 def test_at_any_distance_what_is_not_there_is_not_found(bundle: Bundle) -> None:
