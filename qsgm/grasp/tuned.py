@@ -145,18 +145,23 @@ class TunedObject:
 
         That is half to twice the demonstration's.
         """
-        seen = self._seen(frame)
-        heatmap = self.heatmap(seen)
-        first = self._best(frame, seen, heatmap, QUICK)
+        first, heatmap = self.locate(frame)
         if first.found:
             return first, heatmap
-        closely = self._best(frame, seen, heatmap, THOROUGH)
-        looks = [(_surely(closely, SURE_MORE_CLOSELY), heatmap)]
+        looks = [(self._more_closely(frame, heatmap), heatmap)]
         for other in self._at_other_sizes(frame):
             there, its_heatmap = other.locate(frame)
             looks.append((_surely(there, SURE_AT_OTHER_SIZES), its_heatmap))
         found = [look for look in looks if look[0].found]
         return max(found, key=lambda look: look[0].quality, default=(first, heatmap))
+
+    def _more_closely(self, frame: NDArray[np.uint8], heatmap: NDArray[np.float32]) -> Detection:
+        """The best place by a thorough look.
+
+        What the network saw of the frame is made anew: kept, it would be 37 MB of a large one.
+        """
+        closely = self._best(frame, self._seen(frame), heatmap, THOROUGH)
+        return _surely(closely, SURE_MORE_CLOSELY)
 
     def _at_other_sizes(self, frame: NDArray[np.uint8]) -> Iterator["TunedObject"]:
         """The same object as if it were larger or smaller, where the frame can be searched so."""
