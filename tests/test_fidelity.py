@@ -57,6 +57,16 @@ def test_the_cosine_sees_direction_only() -> None:
     assert cosine(np.array([[1, 0]], np.float32), np.array([[0, 2]], np.float32)) == 0
 
 
+@pytest.mark.parametrize("size", [1e-6, 1e3])
+def test_gradients_of_any_size_are_compared_alike(size: float) -> None:
+    quantized = GRADIENT + RNG.normal(scale=0.1, size=GRADIENT.shape).astype(np.float32)
+    usual = asdict(fidelity_of(quantized, GRADIENT, 2 * GRADIENT))
+    scale = np.float32(size)
+    other = fidelity_of(scale * quantized, scale * GRADIENT, 2 * scale * GRADIENT)
+    assert asdict(other) == pytest.approx(usual, rel=1e-4)
+    assert usual["norm_ratio_int8_true"] == pytest.approx(0.5, abs=0.02)
+
+
 def test_a_vanishing_gradient_gives_zeros_not_nan() -> None:
     values = fidelity_of(GRADIENT, NOTHING, NOTHING)
     assert values.cos_int8_true == values.norm_ratio_int8_true == values.weighted_error == 0

@@ -1,5 +1,7 @@
 """What every command shares: usage errors, exit codes, single lines, interrupts."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -130,6 +132,22 @@ def test_a_full_disk_behind_stdout_is_one_line(
 ) -> None:
     outcome = predict_into(taught, frame_path, f"{options} >/dev/full")
     assert_refused(outcome, 1, "cannot write to standard output: no space left on device")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_standard_output_says_how_much_it_took_also_once_it_cannot_be_written_to() -> None:
+    code = (
+        "import contextlib, sys; from qsgm.cli.streams import use_streams; use_streams()\n"
+        "with contextlib.suppress(Exception): print(sys.stdout.buffer.write(b'x' * 200_000), "
+        "file=sys.stderr)\n"
+        "print(sys.stdout.buffer.write(b'more'), file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("x" * 200_000 + "more", "200000\n4\n")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=True)
+    assert done.stderr == "4\n"
 
 
 @pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])

@@ -14,6 +14,7 @@ from toy_objects import TOY_AT, both_on_a_table, hook, teach
 from toys import lay, table, toy
 
 from qsgm import paths, watch
+from qsgm.cli.watching import _follow
 from qsgm.images import write_png
 
 FRAMES = 3
@@ -75,6 +76,18 @@ def test_a_damaged_frame_leaves_no_video(qsgm: Run, belt: Path, tmp_path: Path) 
     assert (outcome.code, len(outcome.out.splitlines())) == (1, 2)
     assert "2.png is empty" in outcome.err.splitlines()[-1]
     assert not (tmp_path / "seen.avi").exists()
+
+
+def test_the_summary_of_a_stream_without_frames_is_of_zeros(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _follow(iter(()), None) is None
+    out, err = capsys.readouterr()
+    assert out == ""
+    frames, latency = err.splitlines()[0].split("; ")
+    assert frames.startswith("0 frames in ")
+    assert frames.endswith(" s: 0.0 frames/s")
+    assert latency == "latency 0 ms median, 0 ms at the 95th percentile"
 
 
 def test_an_interrupt_ends_with_a_summary_and_a_whole_video(belt: Path, tmp_path: Path) -> None:

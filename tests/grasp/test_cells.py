@@ -86,6 +86,14 @@ def test_a_third_of_the_object_may_be_hidden_and_the_rest_is_aligned(
     assert look.score == fit.score
 
 
+@pytest.mark.parametrize("off", [(6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0)])
+def test_a_fit_may_be_off_as_far_above_and_below_as_to_the_sides(off: tuple[float, float]) -> None:
+    scene = pyramid_of(lay(toy(), table(1), CENTER, 40))
+    start = Fit(0.0, math.radians(40), 1.0, (CENTER[0] + off[0], CENTER[1] + off[1]))
+    fit, _ = APPEARANCE.aligner.aligned(scene, start)
+    assert math.dist(APPEARANCE.center_of(fit), CENTER) < 0.5
+
+
 def test_what_cells_are_cut_from_is_the_patchs_middle_at_half_size_its_mask_a_share() -> None:
     patch = cut_patch(lay(toy(), table(), CENTER), CENTER)
     image, mask = upright(Template(patch))

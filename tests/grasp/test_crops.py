@@ -17,6 +17,7 @@ from qsgm.grasp.crops import (
     NEGATIVE_DISTANCE_PX,
     POSITIVE_JITTER_PX,
     CropPlan,
+    _color_jitter,
     cut_crops,
     cut_widened,
     label_crops,
@@ -178,6 +179,20 @@ def test_colour_maps_are_applied_and_saturate() -> None:
     window = frame[176:304, 256:384, 2].astype(int)
     assert not crop[:, :, :2].any()
     np.testing.assert_array_equal(crop[:, :, 2], np.minimum(2 * window + 10, 255))
+
+
+def test_colours_change_by_saturation_white_balance_contrast_about_grey_and_brightness() -> None:
+    """From the definition, colour by colour, with numbers drawn in the same order."""
+    maps, rng, count = _color_jitter(np.random.default_rng(3), 40), np.random.default_rng(3), 40
+    contrast, saturation = rng.uniform(0.8, 1.25, count), rng.uniform(0.7, 1.3, count)
+    white, brightness = rng.uniform(0.9, 1.1, (count, 3)), rng.uniform(-25, 25, count)
+    for number in range(count):
+        for color in np.array([[255, 0, 0], [10, 200, 90], [128, 128, 128]], float):
+            grey = 0.114 * color[0] + 0.587 * color[1] + 0.299 * color[2]
+            pale = grey + saturation[number] * (color - grey)
+            seen = 128 + contrast[number] * (white[number] * pale - 128) + brightness[number]
+            got = maps[number] @ np.append(color, 1)
+            np.testing.assert_allclose(got, seen, atol=1e-3)
 
 
 def test_labels_say_the_turn_plus_the_offset_and_nothing_for_negatives() -> None:

@@ -163,6 +163,16 @@ def test_a_plan_is_in_range_and_pastes_the_same_whole_or_in_slices(things: Distr
     assert not np.array_equal(first, some_crop())
 
 
+def test_the_light_of_a_pasted_thing_is_its_own_times_a_tint_of_each_channel() -> None:
+    rng = np.random.default_rng(4)
+    light, tint = rng.uniform(0.75, 1.2, (300, 1)), rng.uniform(0.9, 1.1, (300, 3))
+    plan = plan_pastes(np.random.default_rng(4), 300, 5)
+    for number in range(300):
+        for channel in range(3):
+            product = 256 * light[number, 0] * tint[number, channel]
+            assert plan.gain[number, channel] == round(product)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_an_edge_is_painted_as_its_formula_says(seed: int) -> None:
     plan = plan_edges(np.random.default_rng(seed), 3)
