@@ -70,6 +70,15 @@ def test_classes_and_labels_are_the_same_samples(tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.inputs, inputs())
 
 
+@pytest.mark.parametrize("labels", [np.eye(3, dtype=np.int64)[np.arange(10) % 3], np.zeros(10)])
+def test_only_whole_numbers_in_a_row_are_classes(
+    tmp_path: Path, labels: np.ndarray[Any, Any]
+) -> None:
+    path = saved(tmp_path / "a.npz", samples=inputs(), labels=labels)
+    said = refused(lambda: TASK.read(path))
+    assert f"labels are {labels.dtype} {labels.shape}, expected float32 (10, 3)" in said
+
+
 def test_packed_arrays_in_any_order_are_read(tmp_path: Path) -> None:
     path = tmp_path / "packed.npz"
     np.savez_compressed(path, samples=np.asfortranarray(inputs()), more=np.zeros(3))

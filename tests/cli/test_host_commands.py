@@ -26,11 +26,15 @@ def test_speed_needs_a_step_to_time(qsgm: Run) -> None:
     assert_refused(qsgm("bench", "speed", "--epochs", 0), 2, "--epochs")
 
 
-def test_drawing_a_calibration_set_prints_one_json_object(qsgm: Run, tmp_path: Path) -> None:
+def test_drawing_a_calibration_set_says_where_it_is_or_one_json_object(
+    qsgm: Run, tmp_path: Path
+) -> None:
     folder = tmp_path / "calib"
     outcome = qsgm("draw-calibration", "--count", 1, "--seed", 3, "-o", folder, "--json")
     assert outcome.json == {"output": str(folder), "frames": 1, "seed": 3}
     assert (folder / "frame_00.jpg").is_file()
+    told = qsgm("draw-calibration", "--count", 1, "--seed", 3, "-o", folder)
+    assert told.out == f"calibration set: {folder}\n"
 
 
 def test_pretrain_passes_on_encoding_and_hidden_channels(

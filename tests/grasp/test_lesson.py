@@ -12,7 +12,7 @@ from qsgm import finetune, load_object
 from qsgm.bundle import Bundle
 from qsgm.grasp.angles import AngleEncoding, encode_angle
 from qsgm.grasp.crops import CROPS, TRAIN_CROPS
-from qsgm.grasp.lesson import GraspLabels, Orientation
+from qsgm.grasp.lesson import GraspLabels, GraspLesson, Orientation
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask, distractors_of
 from qsgm.grasp.taught import FinetuneResult, finetune_json
@@ -35,6 +35,19 @@ def test_labels_are_shifted_by_the_orientation_the_network_sees(
     np.testing.assert_allclose(prepared.labels[positive, 1:], expected[positive], atol=1e-5)
     assert (prepared.labels[~positive] == 0).all()
     assert 0 <= prepared.orientation.strength <= 1
+
+
+def test_only_taught_crops_with_the_object_say_how_it_lies(frame: Frame, bundle: Bundle) -> None:
+    lesson = GraspLesson(planned(frame, bundle))
+    plan, taught = lesson.crops.plan, np.arange(len(lesson)) < TRAIN_CROPS
+    lies = np.where(taught & (plan.quality > 0), 0.3, 1.1)
+    outputs = np.concatenate(
+        [plan.quality[:, None], encode_angle(plan.turn_rad + lies)], axis=1, dtype=np.float32
+    )
+    seen = lesson.orientation(outputs)
+    assert seen.offset_rad == pytest.approx(0.3, abs=1e-5)
+    assert seen.strength == pytest.approx(1, abs=1e-5)
+    assert seen.of_each_rad == (seen.offset_rad,)
 
 
 @pytest.mark.parametrize("encoding", ["double", "paper"])

@@ -139,6 +139,32 @@ def test_a_names_dark_rim_lies_around_its_letters(enlarged: bool) -> None:
     assert 0 <= changed[-1] - ink[-1] <= 6
 
 
+@pytest.mark.parametrize("size", [(480, 1280), (1280, 480)])
+def test_what_was_not_found_is_listed_above_the_lower_end(size: tuple[int, int]) -> None:
+    frame = np.full((*size, 3), 128, dtype=np.uint8)
+    picture = draw_objects(frame, [("hat", detection(found=False))], enlarged=False).astype(int)
+    unit = max(size[1] / 1280, 0.6)
+    _, bottom, left, _ = extent(picture.max(axis=2) - picture.min(axis=2) > 60)
+    assert size[0] - 1 - bottom == pytest.approx(16 * unit, abs=3)
+    assert left == pytest.approx(12 * unit, abs=4)
+
+
+def test_where_nothing_was_found_a_dashed_ring_is_around_the_best_guess() -> None:
+    """Twelve dashes, of 15 degrees and as far apart, and a pixel or two more at their ends."""
+    picture = drawn(found=False)[:960].astype(int)
+    inked = picture.max(axis=2) - picture.min(axis=2) > 60
+
+    def on_it(degrees: float) -> bool:
+        turn = np.radians(degrees)
+        return bool(inked[round(600 + 64 * np.sin(turn)), round(400 + 64 * np.cos(turn))])
+
+    for dash in range(0, 360, 30):
+        assert all(on_it(dash + degrees) for degrees in (1, 4, 8, 12, 14))
+        assert not any(on_it(dash + degrees) for degrees in (18.5, 21, 24, 26.5))
+    rows, columns = inked.nonzero()
+    assert np.abs(np.hypot(columns - 400, rows - 600) - 64).max() < 5
+
+
 def test_of_a_long_title_as_much_is_left_as_has_room() -> None:
     title = "a name that never ends " * 20
     for room in (100, 500):

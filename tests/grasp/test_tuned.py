@@ -25,6 +25,7 @@ from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import (
     MARGIN_PX,
+    MOST_VIEWS,
     OTHER_SIZES,
     ObjectDescription,
     TunedObject,
@@ -487,6 +488,21 @@ def test_a_description_of_version_2_that_says_nonsense_is_refused(
     path = tmp_path / "toy" / DESCRIPTION
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     assert "again" in refusal(tmp_path / "toy")
+
+
+def test_of_a_description_with_too_many_views_no_more_are_read_than_shows_that(
+    bundle: Bundle, tmp_path: Path
+) -> None:
+    save_object(tmp_path / "toy", described(), bundle.network_with({}), {})
+    path = tmp_path / "toy" / DESCRIPTION
+    values = json.loads(path.read_text())
+    (view,) = values["views"]
+    values["views"] = [view] * (MOST_VIEWS + 1) + [view | {"file": "missing.png"}]
+    path.write_text(json.dumps(values))
+    assert "'views' or 'scale' is damaged" in refusal(tmp_path / "toy")
+    values["views"] = [view] * MOST_VIEWS
+    path.write_text(json.dumps(values))
+    assert len(load_object(tmp_path / "toy").description.views) == MOST_VIEWS
 
 
 @pytest.mark.parametrize("key", ["scale", "views", "made"])

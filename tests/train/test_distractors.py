@@ -1,6 +1,7 @@
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
+from qsgm.grasp import distractors
 from qsgm.grasp.distractors import (
     GRAIN,
     Distractors,
@@ -21,6 +23,7 @@ from qsgm.grasp.distractors import (
     plan_edges,
     plan_pastes,
 )
+from qsgm.grasp.pixels import arithmetic
 from qsgm.train.grasp.draw_distractors import distractor_file, draw_sheet, encode_sheet
 from qsgm.train.grasp.drawing.shapes import OBJECT_KINDS
 
@@ -146,6 +149,27 @@ def test_a_thing_outside_the_crop_leaves_it_alone(things: Distractors) -> None:
         spot = np.array(center, np.float32)
         paste(crop, things.sprites[0], things.reach_px[0], center_px=spot, shadow=Shadow((9, 9), 3))
     assert np.array_equal(crop, some_crop())
+
+
+@pytest.mark.parametrize("degrees", [0, 35, 80, 90, 200])
+def test_no_more_of_a_crop_is_worked_on_than_the_thing_covers(
+    things: Distractors, degrees: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worked, usual = [], arithmetic()
+
+    def warp(sprite: NDArray, motion: NDArray, border: int, layer: NDArray) -> None:
+        worked.append(layer.shape[:2])
+        usual.warp(sprite, motion, border, layer)
+
+    monkeypatch.setattr(distractors, "arithmetic", lambda: replace(usual, warp=warp))
+    turn, center = np.radians(degrees), np.full(2, 64, np.float32)
+    for sprite, reach in zip(things.sprites, things.reach_px, strict=True):
+        x, y = reach.tolist()
+        paste(some_crop(), sprite, reach, center_px=center, turn_rad=turn, scale=0.5)
+        cos, sin = abs(np.cos(turn)) / 2, abs(np.sin(turn)) / 2
+        height, width = worked.pop()
+        assert width <= 2 * (cos * x + sin * y + 1) + 3
+        assert height <= 2 * (sin * x + cos * y + 1) + 3
 
 
 def test_a_plan_is_in_range_and_pastes_the_same_whole_or_in_slices(things: Distractors) -> None:
