@@ -98,6 +98,14 @@ def test_what_was_read_cannot_be_changed(bundle: Bundle) -> None:
     manifest: Any = bundle.manifest
     with pytest.raises(FrozenInstanceError):
         manifest.trunk = "int8"
+    for entry, key in (
+        (manifest.files["network.onnx"], "sha256"),
+        (manifest.sgms[5], "convolutions"),
+        (manifest.initializers["bias6"], "offset"),
+        (manifest.recipes["sgm"], "optimizer"),
+    ):
+        with pytest.raises(FrozenInstanceError):
+            setattr(entry, key, None)
     for values in (manifest.files, manifest.sgms, manifest.recipes, manifest.task.settings):
         with pytest.raises(TypeError, match="does not support item assignment"):
             values["x"] = 1
@@ -136,6 +144,16 @@ def test_a_key_that_holds_something_else_is_refused_by_its_name(
         manifest_from(written | {key: junk}, bundle_folder / MANIFEST)
     assert f"manifest.json: {key!r} " in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("bias6", [1, 3]), ("weight6", [16, 3, 1, 1])])
+def test_numbers_of_another_shape_than_their_layers_are_refused(
+    bundle_folder: Path, written: dict[str, Any], name: str, shape: list[int]
+) -> None:
+    places = written["initializers"]
+    other = places | {name: places[name] | {"shape": shape}}
+    with pytest.raises(QsgmError, match="'initializers' is damaged"):
+        manifest_from(written | {"initializers": other}, bundle_folder / MANIFEST)
 
 
 @pytest.mark.parametrize(

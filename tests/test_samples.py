@@ -23,7 +23,7 @@ from qsgm import (
 )
 from qsgm.samples.arrays import NAME, ArraysTask, read_npz
 from qsgm.samples.lesson import fallen, head_scores, lesson_of
-from qsgm.samples.taskfile import read_samples, task_for
+from qsgm.samples.taskfile import read_samples, task_for, tuned_of
 from qsgm.task import TaskRecord, task_record
 
 NETWORK = Network((2, 3, 1), (conv(1, 4, (2, 3)), conv(4, 3, relu=False)), "numbers")
@@ -68,6 +68,17 @@ def test_classes_and_labels_are_the_same_samples(tmp_path: Path) -> None:
     assert other.labels is not None
     np.testing.assert_array_equal(other.labels, labels)
     np.testing.assert_array_equal(one.inputs, inputs())
+
+
+@pytest.mark.parametrize(
+    ("said", "layers"),
+    [({"tuned": 1}, 1), ({"tuned": 4}, 4), ({}, 2), *(({"tuned": n}, 2) for n in (0, 5, "2", 2.0))],
+)
+def test_as_many_layers_are_tuned_as_the_task_said_or_as_usual(
+    said: dict[str, Any], layers: int
+) -> None:
+    network = Network((2, 3, 1), (conv(1, 4, (2, 3)), *(conv(4, 4),) * 2, conv(4, 3, relu=False)))
+    assert tuned_of(TaskRecord("mine", network, HEADS, said)) == layers
 
 
 @pytest.mark.parametrize("labels", [np.eye(3, dtype=np.int64)[np.arange(10) % 3], np.zeros(10)])

@@ -39,7 +39,8 @@ def test_the_canvas_is_large_enough_for_crisp_text(size: tuple[int, int]) -> Non
     assert picture.dtype == np.uint8
     assert picture.shape[1] >= 1280
     assert picture.shape[1] % size[1] == 0
-    assert picture.shape[0] > size[0] * picture.shape[1] // size[1]
+    caption = picture.shape[0] - size[0] * picture.shape[1] // size[1]
+    assert caption == pytest.approx(150 * picture.shape[1] / 1280, abs=0.5)
 
 
 def test_the_frame_and_the_heatmap_are_left_as_they_were() -> None:

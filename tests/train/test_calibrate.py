@@ -21,6 +21,7 @@ from qsgm.grasp.lesson import GraspLesson
 from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import GraspTask
 from qsgm.images import read_frame, write_png
+from qsgm.network import Network, conv
 from qsgm.sgm.float import FloatArray, float_trace
 from qsgm.sgm.int8 import ACTIVATION_BITS, SgmRanges, integer_forward, quantize_sgm
 from qsgm.sgm.ranges import CALIBRATORS, Observer, Span
@@ -46,6 +47,7 @@ from qsgm.train.quantization.calibrate import (
 from qsgm.train.quantization.calibration_runs import (
     RunPlan,
     Trainee,
+    one_position,
     prepare,
     run,
     run_plans,
@@ -334,6 +336,9 @@ def test_sgms_ahead_of_the_last_three_layers_get_a_short_run_of_all_layers() -> 
     assert short.epochs < 40
     assert [[*plan.measured] for plan in (*whole, short)] == [[5], [4, 5], [1, 2, 3]]
     assert [*run_plans(GRASPNET, 4, 1)[-1].measured] == [3]
+    flat = Network((1, 1, 2), (conv(2, 4), conv(4, 4), conv(4, 3, relu=False)), "numbers")
+    assert [plan.tuned for plan in run_plans(flat, 3, 40)] == [2, 3]
+    assert (one_position(flat), one_position(GRASPNET)) == (3, 3)
 
 
 def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) -> None:
