@@ -71,3 +71,19 @@ def test_the_loop_takes_other_crops_in_the_place_of_those_it_has(net: FoldedNet)
         assert one_by_one.step(np.arange(len(rows))) == whole.step(rows)
     for name, value in whole.weights().items():
         np.testing.assert_array_equal(one_by_one.weights()[name], value)
+
+
+def test_the_loop_takes_back_the_crops_that_it_had_before_others(net: FoldedNet) -> None:
+    data = random_data(3)
+    others = {name: values[::-1].copy() for name, values in data.items()}
+    model = step_model(net, single_layers(GRASPNET.last(3)), quiet(random_sgms()), HEADS, Sgd())
+    feeds = Exported(model, net, data).feeds
+    start = {name: feeds[name].copy() for k in (4, 5, 6) for name in (f"weight{k}", f"bias{k}")}
+    rates = {number: RATES[number] for number in (4, 5, 6)}
+    loop, same = (
+        StepLoop(session(model), data["features"], data["labels"], start, rates) for _ in range(2)
+    )
+    (rows, *_) = batches(1)
+    loop.put(others["features"], others["labels"])
+    loop.put(data["features"], data["labels"])
+    assert loop.step(rows) == same.step(rows)
