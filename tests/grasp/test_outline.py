@@ -18,6 +18,8 @@ def test_inside_is_inside_and_outside_is_outside_all_around() -> None:
     for points, low, high in ((outline.inner, 16, 20), (outline.outer, 20, 24)):
         away = np.hypot(*(points - 31.5).T)
         assert low < away.min() < away.max() < high
+        from_it = np.hypot(*(points - np.tile(outline.points, (2, 1))).T).reshape(2, -1)
+        np.testing.assert_allclose(from_it, np.broadcast_to([[1.5], [3.0]], from_it.shape), 1e-4)
 
 
 def test_contrast_is_the_colours_distance_where_the_object_ends() -> None:

@@ -239,7 +239,7 @@ def assert_same_ranges(got: SgmRanges, expected: SgmRanges) -> None:
 def test_few_frames_judge_the_ranges_taken_from_them(folder: Path, trainee: Trainee) -> None:
     stages: list[tuple[str, int, int]] = []
     watch = lambda *stage: stages.append(stage)  # noqa: E731
-    result = calibrate(trainee, lessons_in(folder), 0, watch, EPOCHS, activation_bits=8)
+    result = calibrate(trainee, lessons_in(folder), 0, watch, EPOCHS)
     assert result.held_out == 0
     assert stages[3:] == [("choose", done, 2) for done in (0, 1, 2)]
     assert all(0.9 < value <= 1 for value in result.cosines[5].values())
