@@ -86,6 +86,10 @@ def test_detection_counts_both_kinds_of_error_and_angles_are_modulo_180() -> Non
         assert scores[f"angle_mae_deg{ending}"] == pytest.approx((2 + 4) / 2, abs=1e-4)
 
 
+def test_of_a_thousand_crops_a_fifth_is_held_out(result: FinetuneResult) -> None:
+    assert (len(result.prepared.labels), result.prepared.taught) == (1000, 800)
+
+
 def toy_frame(turn_deg: float = 0.0, seed: int = 0) -> Frame:
     return lay(toy(), table(seed), (320.0, 240.0), turn_deg)
 
