@@ -75,6 +75,15 @@ def test_less_light_changes_no_colours_and_another_hue_does() -> None:
     assert taught.tint(dim) < 0.1 < taught.tint(other)
 
 
+@pytest.mark.parametrize("color", [(0, 0, 0), (250, 30, 4), (60, 128, 255)])
+def test_a_hue_is_of_levels_and_a_dozen_more(color: tuple[int, int, int]) -> None:
+    blue, green, red = (level + 12 for level in color)
+    seen = Colours.of(np.array([color] * 3, np.float32))
+    expected = np.log([red / green, blue / green])
+    np.testing.assert_allclose(seen.middle, expected, atol=1e-5)
+    np.testing.assert_allclose(seen.mean, np.log([blue, green, red]), atol=1e-5)
+
+
 def test_what_is_black_has_no_hue() -> None:
     rng = np.random.default_rng(1)
     one, other = (Colours.of(rng.uniform(0, 4, (300, 3)).astype(np.float32)) for _ in range(2))
