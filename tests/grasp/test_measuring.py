@@ -9,7 +9,13 @@ from toys import lay, table, toy
 
 from qsgm import QsgmError
 from qsgm.bench.subjects import drawn_subjects
-from qsgm.grasp.measuring import measured_span, moved_point, scale_for, scaled_frame
+from qsgm.grasp.measuring import (
+    _span_of_large,
+    measured_span,
+    moved_point,
+    scale_for,
+    scaled_frame,
+)
 
 
 def shown(scale: float, frame_hw: tuple[int, int] = (480, 640), turn_deg: float = 25) -> Any:
@@ -38,6 +44,20 @@ def test_an_object_that_nearly_fills_its_frame_is_measured(
     scale: float, frame_hw: tuple[int, int]
 ) -> None:
     assert measured_span(*shown(scale, frame_hw, 60)) == pytest.approx(90 * scale, rel=0.1)
+
+
+def test_a_cut_of_the_whole_frame_measures_what_spans_a_fifth_of_it_and_more() -> None:
+    for scale in (1.2, 1.6, 2.0, 3.4):
+        assert _span_of_large(*shown(scale)) == pytest.approx(90 * scale, rel=0.1)
+    for scale in (0.6, 0.9):
+        assert _span_of_large(*shown(scale)) is None
+
+
+def test_a_larger_thing_close_by_is_not_what_lies_at_the_centre() -> None:
+    frame = table(1)
+    cv2.rectangle(frame, (255, 232), (385, 248), (30, 30, 200), cv2.FILLED)
+    cv2.rectangle(frame, (190, 282), (450, 382), (30, 30, 200), cv2.FILLED)
+    assert _span_of_large(frame, (320.0, 240.0)) == pytest.approx(130, rel=0.1)
 
 
 def test_a_table_that_looks_like_a_large_thing_is_not_taken_for_one() -> None:
