@@ -421,9 +421,13 @@ def _identity(folder: Path) -> tuple[int, ...] | None:
 
 def _resolved(path: Path) -> Path:
     try:
-        return path.resolve()
+        place = path.resolve()
+        # Links in a circle, which from Python 3.13 on are resolved to themselves.
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            place.stat()
     except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a null byte
         raise _cannot_write(path, error) from error
+    return place
 
 
 def _cannot_write(path: Path, error: Exception) -> QsgmError:

