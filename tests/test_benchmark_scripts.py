@@ -139,7 +139,7 @@ def test_depth_compares_steps_with_backpropagations_and_draws(tmp_path: Path) ->
 def test_a_look_is_compared_with_the_networks_alone_and_finds_what_is_there(tmp_path: Path) -> None:
     printed, values = told(tmp_path, "look.py", "--objects", 1, "--repeats", 1)
     assert max(map(len, printed.splitlines())) <= 80
-    assert set(values["ms"]) == {"look", "network_alone"}
+    assert set(values["ms"]) == {"look", "network_alone", "nothing_found"}
     for key in ("first_ms", "median_ms", "least_ms"):
         times = [values["ms"][name][key] for name in ("look", "network_alone")]
         assert values["ratio"][key] == pytest.approx(times[0] / times[1])
