@@ -1,5 +1,6 @@
 """Two objects as `qsgm finetune` leaves them, but not tuned: by the shipped network."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from toys import SIDE, by_correlation, lay, table, toy
 
 from qsgm import load_bundle, paths
+from qsgm.grasp.decision import Decision
 from qsgm.grasp.patch import cut_patch
 from qsgm.grasp.shown import View
 from qsgm.grasp.tuned import ObjectDescription, save_object
@@ -24,6 +26,7 @@ MADE = {
 }
 TOY_AT, HOOK_AT = (170.0, 150.0), (450.0, 320.0)
 TURN_DEG = 40.0
+MUG = ObjectDescription("mug", "double", 0.25)
 
 
 def hook() -> NDArray[np.float32]:
@@ -35,12 +38,20 @@ def hook() -> NDArray[np.float32]:
     return picture
 
 
+def described(
+    picture: NDArray[np.float32] | None = None, decision: Decision | None = None, scale: float = 1.0
+) -> ObjectDescription:
+    """A toy as it is kept, by default with a decision by correlation alone."""
+    center = (320.0, 240.0)
+    frame = lay(toy() if picture is None else picture, table(), center)
+    view = View(cut_patch(frame, center), 0.0, whole=True)
+    chosen = by_correlation() if decision is None else decision
+    return ObjectDescription("toy", "double", 0.0, scale, (view,), chosen, {"seed": 4})
+
+
 def teach(folder: Path, name: str, picture: NDArray[np.float32], threshold: float = 0.8) -> Path:
     """Keep an object in a folder; it is found where its patch correlates as well as that."""
-    center = (320.0, 240.0)
-    patch = cut_patch(lay(picture, table(), center), center)
-    view = View(patch, 0.0, whole=True)
-    about = ObjectDescription(name, "double", 0.0, 1.0, (view,), by_correlation(threshold), MADE)
+    about = replace(described(picture, by_correlation(threshold)), name=name, made=MADE)
     save_object(folder, about, load_bundle(paths.bundle_folder()).network_with({}), {"seed": 0})
     return folder
 

@@ -12,10 +12,10 @@ from qsgm.cli.console import (
     check_output,
     host_module,
     open_bundle,
-    print_json,
     progress,
     show,
     tell,
+    tell_or_print,
     write_report,
 )
 from qsgm.cli.options import (
@@ -108,10 +108,8 @@ def pretrain(
     config, drawn = host.PretrainConfig(**chosen), host.DrawnGrasping(encoding=encoding.value)
     with progress() as watch:
         host.pretrain_grasping(drawn, output, seed, device.value, watch, config)
-    if as_json:
-        print_json({"output": str(output), "seed": seed, "device": device.value})
-    else:
-        tell("pretrained", output)
+    values = {"output": str(output), "seed": seed, "device": device.value}
+    tell_or_print("pretrained", output, values, as_json)
 
 
 @app.command("draw-calibration")
@@ -127,10 +125,8 @@ def draw_calibration(
     host = host_module("qsgm.train.grasp.draw_calibration")
     with progress() as watch:
         host.draw_calibration_set(output, count, seed, watch)
-    if as_json:
-        print_json({"output": str(output), "frames": count, "seed": seed})
-    else:
-        tell("calibration set", output)
+    values = {"output": str(output), "frames": count, "seed": seed}
+    tell_or_print("calibration set", output, values, as_json)
 
 
 @app.command("teach-comparer")
@@ -148,10 +144,8 @@ def teach_comparer(
     host = host_module("qsgm.train.grasp.teach_comparer")
     with progress() as watch:
         host.teach_comparer(checkpoint, output, seed, device.value, processes, watch)
-    if as_json:
-        print_json({"output": str(output), "seed": seed, "device": device.value})
-    else:
-        tell("comparer", output)
+    values = {"output": str(output), "seed": seed, "device": device.value}
+    tell_or_print("comparer", output, values, as_json)
 
 
 @app.command("fold-and-quantize")

@@ -36,6 +36,14 @@ def tell(what: str, path: Path) -> None:
     typer.echo(f"{what}: {as_text(str(path), 5000)}")
 
 
+def tell_or_print(what: str, path: Path, values: dict[str, Any], as_json: bool) -> None:
+    """Where something has been written, or, for machines, all that is worth knowing of it."""
+    if as_json:
+        print_json(values)
+    else:
+        tell(what, path)
+
+
 def terminal(*, stderr: bool = False) -> Console:
     """A stream to draw on, of a width that something fits into: COLUMNS may say anything."""
     console = Console(stderr=stderr)

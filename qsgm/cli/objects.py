@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qsgm.cli.console import check_output, print_json, show, tell
+from qsgm.cli.console import check_output, show, tell_or_print
 from qsgm.cli.options import JsonOption
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError, as_text
@@ -69,7 +69,7 @@ def remove(
     if not yes and not _agreed(f"remove {as_text(str(folder), 5000)} for good?"):
         raise QsgmError(f"{folder} stays: nobody said yes; pass --yes to remove it")
     remove_object(folder)
-    _done({"removed": str(folder)}, "removed", folder, as_json)
+    tell_or_print("removed", folder, {"removed": str(folder)}, as_json)
 
 
 @app.command("rename")
@@ -84,7 +84,7 @@ def rename(
     old = find_object(name, names_first=True)
     folder = rename_object(old, new)
     values = {"renamed": str(old), "name": new, "folder": str(folder)}
-    _done(values, f"{new} is now", folder, as_json)
+    tell_or_print(f"{new} is now", folder, values, as_json)
 
 
 @app.command("export")
@@ -107,20 +107,13 @@ def export(
     check_output(output, *folder.glob("*"))
     network, values = graph_of(folder)
     write_bytes_atomic(output, network)
-    _done(values | {"output": str(output)}, "graph", output, as_json)
+    tell_or_print("graph", output, values | {"output": str(output)}, as_json)
 
 
 def head_told(head: dict[str, Any]) -> str:
     """A head in a few words."""
     channels = head["channels"]
     return f"{head['kind']}, {channels} channel{'s' * (channels > 1)}, {head['activation']}"
-
-
-def _done(values: dict[str, Any], what: str, path: Path, as_json: bool) -> None:
-    if as_json:
-        print_json(values)
-    else:
-        tell(what, path)
 
 
 def _agreed(question: str) -> bool:

@@ -4,13 +4,11 @@ What :mod:`qsgm.grasp.evidence` lists sums a comparison up in numbers; where in 
 differ is lost in them. This one sees both pictures, moved and turned so that the object lies alike,
 and says how likely they show the same thing (a two-channel network, Zagoruyko and Komodakis 2015).
 It learnt that on drawn objects (:mod:`qsgm.train.grasp.comparer`) and learns nothing on the device:
-its answer is one more piece of evidence. 27,000 weights of 8 bits.
+its answer is one more piece of evidence. 24,000 weights of 8 bits.
 """
 
 import base64
 import binascii
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -82,10 +80,6 @@ class Comparer:
             "scales": scales,
             "biases": biases,
         }
-
-    def digest(self) -> str:
-        """SHA-256 of its numbers."""
-        return hashlib.sha256(json.dumps(self.to_json()).encode()).hexdigest()
 
     @staticmethod
     def from_json(values: Mapping[str, Any], where: str) -> "Comparer":

@@ -40,6 +40,14 @@ _QUALITY_WEIGHT = 0.02
 _SAME_POSE = (20.0, math.radians(25)), (10.0, math.radians(17))
 # Closer than that, two candidates are the same place.
 _SAME_PX = 24.0
+# Where a pose fits so well, the object is there, and no other place is looked at closer by edges.
+_FITS_WELL = 0.8
+# What alignment by pixels has to gain over the pose that edges gave.
+_LEAST_GAIN = 0.02
+# Turns that differ from a half turn by less are the opposite way round.
+_OPPOSITE_RAD = math.radians(30)
+# With such a lead at a quarter of the resolution the other way round need not be looked at closer.
+_CLEAR_LEAD = 0.2
 
 
 @dataclass(frozen=True)
@@ -62,18 +70,9 @@ class Effort:
 
 
 QUICK = Effort.for_places(4)
-# Most of what a quick look misses was laid wrongly: a part of it hidden, or other things beside it.
+# Half of what a quick look misses was laid wrongly: partly hidden, or other things beside it.
 # All poses of a place are judged: the firmest one may be the wrong one.
 THOROUGH = Effort(24, 4, 40, 20, 4, 20, apart_px=0.0)
-
-# Where a pose fits so well, the object is there, and no other place is looked at closer by edges.
-_FITS_WELL = 0.8
-# What alignment by pixels has to gain over the pose that edges gave.
-_LEAST_GAIN = 0.02
-# Turns that differ from a half turn by less are the opposite way round.
-_OPPOSITE_RAD = math.radians(30)
-# With such a lead at a quarter of the resolution the other way round need not be looked at closer.
-_CLEAR_LEAD = 0.2
 
 
 @dataclass(frozen=True)

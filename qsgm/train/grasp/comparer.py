@@ -5,6 +5,7 @@ alone. `qsgm teach-comparer` makes it (:mod:`qsgm.train.grasp.teach_comparer`), 
 weighs what it says together with all other evidence.
 """
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -46,6 +47,11 @@ class ComparerConfig:
     of_the_object: int = 96  # in a batch
     peak_rate: float = 3e-3
     weight_decay: float = 0.02
+
+
+def digest(comparer: Comparer) -> str:
+    """SHA-256 of its numbers."""
+    return hashlib.sha256(json.dumps(comparer.to_json()).encode()).hexdigest()
 
 
 @lru_cache(maxsize=1)

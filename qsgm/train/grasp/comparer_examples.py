@@ -19,7 +19,7 @@ from qsgm.grasp.correlation import Fit, pyramid_of
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import PATCH_PX, cut_patch
 from qsgm.train.grasp.drawing.scenes import DrawnScene
-from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker
+from qsgm.train.grasp.episodes import CENTER_PX, Episode, EpisodeMaker, EpisodesConfig
 
 Image = NDArray[np.uint8]
 # (frame) -> heatmap
@@ -30,16 +30,6 @@ Look = Callable[[Image], NDArray[np.float32]]
 ON_OBJECT_PX, OFF_OBJECT_PX = 12.0, 32.0
 # From the true pose, alignment starts at each of these.
 _SCALES = (0.9, 1.0, 1.12)
-
-
-@dataclass(frozen=True)
-class ExamplesConfig:
-    """How many objects and scenes are drawn."""
-
-    episodes: int = 3799
-    scenes: int = 8  # with the object, and as many without it
-    tables: int = TABLES
-    others: int = OTHERS  # that lie there
 
 
 @dataclass(frozen=True)
@@ -75,7 +65,7 @@ class InTurn(Protocol):
 
 def draw_examples(
     look: Look,
-    config: ExamplesConfig,
+    config: EpisodesConfig,
     seed: int,
     after_episode: Callable[[], None],
     in_turn: InTurn = map,
@@ -103,10 +93,9 @@ def draw_examples(
     )
 
 
-def _of_one_object(look: Look, config: ExamplesConfig, seed: int, number: int) -> OfOneObject:
+def _of_one_object(look: Look, config: EpisodesConfig, seed: int, number: int) -> OfOneObject:
     cv2.setNumThreads(1)  # one process a core
-    maker = _maker(seed, config.tables, config.others)
-    episode = maker.draw(number, config.scenes, without=True)
+    episode = _maker(config, seed).draw(number, config.scenes, without=True)
     appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
     cells = appearance.aligner.cells
     return OfOneObject(
@@ -117,8 +106,8 @@ def _of_one_object(look: Look, config: ExamplesConfig, seed: int, number: int) -
 
 
 @lru_cache(maxsize=1)  # its tables take a second
-def _maker(seed: int, tables: int, others: int) -> EpisodeMaker:
-    return EpisodeMaker(seed, USUAL, tables, others)
+def _maker(config: EpisodesConfig, seed: int) -> EpisodeMaker:
+    return config.maker(seed)
 
 
 def _views(appearance: Appearance, episode: Episode, look: Look) -> Iterator[tuple[Image, bool]]:

@@ -18,7 +18,7 @@ from qsgm.task import Heads
 from qsgm.train.grasp.comparer_examples import Look
 from qsgm.train.grasp.decision import JudgedScene, Weighed
 from qsgm.train.grasp.drawing.scenes import DrawnScene
-from qsgm.train.grasp.episodes import CENTER_PX, OTHERS, TABLES, USUAL, Episode, EpisodeMaker
+from qsgm.train.grasp.episodes import CENTER_PX, Episode, EpisodesConfig
 from qsgm.train.grasp.task import DrawnGrasping, frame_lesson, shipped_things
 from qsgm.train.heads import activate
 from qsgm.train.model.local import LayerState
@@ -28,13 +28,10 @@ from qsgm.train.pretraining.tasks import SeenLesson, TaskSet, see_lesson
 
 
 @dataclass(frozen=True)
-class DecisionScenesConfig:
-    """How many objects and scenes the decision is made on."""
+class DecisionScenesConfig(EpisodesConfig):
+    """How many objects and scenes the decision is made on, and how each object is taught."""
 
     episodes: int = 240
-    scenes: int = 8  # with the object, and as many without it
-    tables: int = TABLES
-    others: int = OTHERS  # that lie there
     crops: int = 1000
     support: int = 800
     epochs: int = 20
@@ -61,7 +58,7 @@ def judged_scenes(
         seed: of the episodes.
         after_episode: told about each.
     """
-    maker = EpisodeMaker(seed, USUAL, config.tables, config.others)
+    maker = config.maker(seed)
     judged: list[JudgedScene] = []
     for first in range(0, config.episodes, config.tasks_at_once):
         numbers = range(first, min(first + config.tasks_at_once, config.episodes))

@@ -66,6 +66,20 @@ class Episode:
     without: tuple[DrawnScene, ...]  # the same ones without it, or with another thing in its place
 
 
+@dataclass(frozen=True)
+class EpisodesConfig:
+    """How many objects are drawn, and how many scenes of each."""
+
+    episodes: int
+    scenes: int = 8  # with the object, and as many without it
+    tables: int = TABLES
+    others: int = OTHERS  # that lie there
+
+    def maker(self, seed: int) -> "EpisodeMaker":
+        """What draws them."""
+        return EpisodeMaker(seed, USUAL, self.tables, self.others)
+
+
 class EpisodeMaker:
     """Draws episodes from one seed; tables and other things are drawn once and used again."""
 

@@ -12,7 +12,7 @@ from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.task import GraspTask
 from qsgm.progress import Progress, counted
 from qsgm.train.checkpoint import Checkpoint
-from qsgm.train.grasp.comparer import shipped_comparer
+from qsgm.train.grasp.comparer import digest, shipped_comparer
 from qsgm.train.grasp.decision import DecisionConfig, fit_decision
 from qsgm.train.grasp.decision_scenes import DecisionScenesConfig, judged_scenes
 from qsgm.train.grasp.task import DrawnGrasping
@@ -31,7 +31,7 @@ class DecisionStage:
 
     def to_json(self) -> dict[str, Any]:
         return {name: asdict(getattr(self, name)) for name in ("scenes", "decision")} | {
-            "comparer": self.comparer.digest()
+            "comparer": digest(self.comparer)
         }
 
     def __call__(self, learnt: Learnt, seed: int, watch: Progress) -> GraspTask:

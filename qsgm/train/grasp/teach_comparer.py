@@ -13,13 +13,14 @@ from qsgm.grasp.task import grasp_task
 from qsgm.progress import Progress, counted
 from qsgm.train.checkpoint import load_checkpoint
 from qsgm.train.grasp.comparer import ComparerConfig, train_comparer
-from qsgm.train.grasp.comparer_examples import ExamplesConfig, Look, draw_examples
+from qsgm.train.grasp.comparer_examples import Look, draw_examples
 from qsgm.train.grasp.decision_scenes import heatmap_of
+from qsgm.train.grasp.episodes import EpisodesConfig
 from qsgm.train.model.fold import folded_start
-from qsgm.train.pretraining.pretrain import check_device
+from qsgm.train.pretraining.pretrain import PretrainConfig, check_device
 from qsgm.train.pretraining.tasks import start_states
 
-_TUNED = 3  # the layers whose start is meta-trained
+DRAWN = EpisodesConfig(3799)
 
 
 def teach_comparer(
@@ -29,8 +30,8 @@ def teach_comparer(
     device: str,
     processes: int,
     watch: Progress,
-    drawn: ExamplesConfig = ExamplesConfig(),  # noqa: B008 (it is frozen)
-    config: ComparerConfig = ComparerConfig(),  # noqa: B008
+    drawn: EpisodesConfig = DRAWN,
+    config: ComparerConfig = ComparerConfig(),  # noqa: B008 (it is frozen)
 ) -> None:
     """Draw examples, learn from them, and write what :func:`shipped_comparer` reads.
 
@@ -62,5 +63,5 @@ def teach_comparer(
 def _untouched(checkpoint_path: Path) -> Look:
     checkpoint = load_checkpoint(checkpoint_path)
     task = grasp_task(checkpoint.task, str(checkpoint_path))
-    states = start_states(folded_start(checkpoint.net, _TUNED), 1)
+    states = start_states(folded_start(checkpoint.net, PretrainConfig().late), 1)
     return partial(heatmap_of, checkpoint.net, states, heads=task.heads)
