@@ -168,6 +168,10 @@ def fold_and_quantize(
     activation_bits: Annotated[
         ActivationBitsChoice, typer.Option(help="Of the int8 SGMs: one u8 plane, or two.")
     ] = ActivationBitsChoice.SIXTEEN,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=1, max=256, help="One core each; default: one for every core, 4 at most."),
+    ] = None,
     task: TaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -176,10 +180,11 @@ def fold_and_quantize(
     bits = int(activation_bits.value)
     chosen = {"blocks": tuple(more), "calibrator": calibrator.value, "activation_bits": bits}
     if task is not None:
-        refuse_options(calib=calib is not None)
+        refuse_options(calib=calib is not None, processes=processes is not None)
         export_task(task, checkpoint, output, chosen, as_json)
         return
     host = host_module("qsgm.train.grasp.export")
+    chosen["processes"] = processes or host_module("qsgm.train.processes").usual_count()
     calibration, options = paths.calibration_folder(calib), host.ExportOptions(**chosen)
     with progress() as watch:
         report = host.fold_and_quantize(checkpoint, calibration, output, watch, options)

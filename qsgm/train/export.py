@@ -60,6 +60,7 @@ from qsgm.train.heads import activate
 from qsgm.train.model.arrays import FLAT_ARRAYS, CurvatureArrays, FoldedNet
 from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
 from qsgm.train.model.net import as_seen
+from qsgm.train.processes import in_processes
 from qsgm.train.quantization.calibrate import AUTO, calibrate
 from qsgm.train.quantization.calibration_runs import EPOCHS, Trainee, prepare
 from qsgm.train.quantization.lessons import Lessons
@@ -87,6 +88,8 @@ class ExportOptions:
     activation_bits: ActivationBits = 16  # of the int8 SGMs' inputs, in one u8 plane or two
     # Groups in which SGMs pay in the place of :func:`grouped`; devices tune those as is usual.
     paying: bool = False
+    # That go through the calibration set, one core each; how many they are changes no byte.
+    processes: int = 1
 
 
 def export_bundle(
@@ -119,11 +122,14 @@ def export_bundle(
     exported = exported_blocks(trainee.network, most, options.blocks, groups)
     fold_error = check_folding(trainee, lessons)
     trainee, int8_trunk = calibrate_trunk(trainee, lessons, watch)
-    calibration = calibrate(trainee, lessons, SEED, watch, options.epochs, options.calibrator, bits)
-    int8_sgms = {
-        k: quantize_sgm(sgm, calibration.ranges[k], bits) for k, sgm in trainee.sgms.items()
-    }
-    fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, options.epochs, calibration.looks)
+    with in_processes(options.processes) as in_turn:
+        epochs, calibrator = options.epochs, options.calibrator
+        calibration = calibrate(trainee, lessons, SEED, watch, epochs, calibrator, bits, in_turn)
+        int8_sgms = {
+            k: quantize_sgm(sgm, calibration.ranges[k], bits) for k, sgm in trainee.sgms.items()
+        }
+        looks = calibration.looks
+        fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, epochs, looks, in_turn)
     graphs = build_graphs(trainee, int8_sgms, int8_trunk, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)

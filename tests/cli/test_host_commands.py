@@ -2,10 +2,12 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from command_line import Run, assert_refused
 
+from qsgm import QsgmError
 from qsgm.cli import console
 
 
@@ -65,6 +67,28 @@ def test_teach_comparer_passes_on_where_it_draws_and_learns(
     outcome = qsgm("teach-comparer", "my.pt", "-o", output, "--processes", 3, "--seed", 2, "--json")
     assert outcome.json == {"output": str(output), "seed": 2, "device": "cpu"}
     assert given == [(Path("my.pt"), output, 2, "cpu", 3)]
+
+
+def test_fold_and_quantize_works_on_every_core_unless_told_otherwise(
+    qsgm: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from qsgm.train import processes
+    from qsgm.train.grasp import export
+
+    given = []
+
+    def refuse(*values: Any) -> None:
+        given.append(values[-1].processes)
+        raise QsgmError("enough")
+
+    monkeypatch.setattr(export, "fold_and_quantize", refuse)
+    monkeypatch.setattr(processes, "usual_count", lambda: 3)
+    for asked in ((), ("--processes", 2)):
+        assert_refused(qsgm("fold-and-quantize", "my.pt", *asked), 1, "enough")
+    assert given == [3, 2]
+    assert_refused(
+        qsgm("fold-and-quantize", "my.pt", "--task", "my.py", "--processes", 2), 1, "--processes"
+    )
 
 
 def test_teach_comparer_refuses_what_is_no_checkpoint_and_leaves_nothing(

@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import pickle
 import tracemalloc
 from io import StringIO
 from pathlib import Path
@@ -35,6 +36,7 @@ from qsgm.train.grasp.objects import TABLE_KINDS
 from qsgm.train.model.fold import fold_sgm, run_folded_sgm
 from qsgm.train.model.net import ConvNet
 from qsgm.train.model.sgm import Sgm
+from qsgm.train.processes import in_processes
 from qsgm.train.quantization import calibration_runs
 from qsgm.train.quantization.calibrate import (
     AUTO,
@@ -152,11 +154,28 @@ def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
 def test_a_frame_alone_gives_part_of_the_ranges(folder: Path, trainee: Trainee) -> None:
     frames = lessons_in(folder)
     both = calibrate(trainee, frames, 0, ignore, EPOCHS, "minmax").ranges
-    alone = observe_lesson(trainee, frames, 1, 0, EPOCHS)
+    alone, _ = observe_lesson(trainee, frames, 0, EPOCHS, 1)
     for layer, observers in alone.items():
         ranges = observers.ranges("minmax", 256, LABELS)
         assert (ranges.input_low >= both[layer].input_low).all()
         assert (ranges.input_high <= both[layer].input_high).all()
+
+
+def test_two_processes_calibrate_and_measure_what_one_does(
+    folder: Path, trainee: Trainee, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # other processes know nothing of it
+    frames, found = lessons_in(folder), []
+    for processes in (1, 2):
+        with in_processes(processes) as in_turn:
+            done = calibrate(trainee, frames, 0, ignore, EPOCHS, in_turn=in_turn)
+            sgms = trainee.sgms.items()
+            int8 = {layer: quantize_sgm(sgm, done.ranges[layer]) for layer, sgm in sgms}
+            fidelity = measure(trainee, int8, frames, 0, ignore, EPOCHS, in_turn=in_turn)
+        found.append((done, fidelity))
+    (one, one_fidelity), (two, two_fidelity) = found
+    assert (one.chosen, one.cosines, one_fidelity) == (two.chosen, two.cosines, two_fidelity)
+    assert pickle.dumps(one.ranges) == pickle.dumps(two.ranges)
 
 
 def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee: Trainee) -> None:
@@ -201,9 +220,9 @@ def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
     result = calibrate(trainee, frames, 0, ignore, EPOCHS, activation_bits=8)
     assert result.held_out == 1
     # By hand: ranges from the first three frames, cosines along the runs on the fourth.
-    seen = observe_lesson(trainee, frames, 0, 0, EPOCHS)
+    seen, _ = observe_lesson(trainee, frames, 0, EPOCHS, 0)
     for i in (1, 2):
-        for layer, observers in observe_lesson(trainee, frames, i, 0, EPOCHS).items():
+        for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, i)[0].items():
             seen[layer].merge(observers)
     inputs = []
 
@@ -223,7 +242,7 @@ def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
     assert [*result.cosines[4]] == [*CALIBRATORS]
     assert result.chosen == {k: best_calibrator(result.cosines[k]) for k in (4, 5)}
     # The frame held out has its part in the ranges all the same.
-    for layer, observers in observe_lesson(trainee, frames, 3, 0, EPOCHS).items():
+    for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, 3)[0].items():
         seen[layer].merge(observers)
         expected = seen[layer].ranges(result.chosen[layer], 256, LABELS)
         assert_same_ranges(result.ranges[layer], expected)
@@ -262,8 +281,8 @@ def test_a_named_calibrator_gives_all_ranges_and_is_not_compared(
     folder: Path, trainee: Trainee
 ) -> None:
     frames = lessons_in(folder)
-    seen = observe_lesson(trainee, frames, 0, 0, EPOCHS)
-    for layer, observers in observe_lesson(trainee, frames, 1, 0, EPOCHS).items():
+    seen, _ = observe_lesson(trainee, frames, 0, EPOCHS, 0)
+    for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, 1)[0].items():
         seen[layer].merge(observers)
     for name, bits in itertools.product(CALIBRATORS, ACTIVATION_BITS):
         result = calibrate(trainee, frames, 0, ignore, EPOCHS, name, bits)

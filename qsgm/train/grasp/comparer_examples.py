@@ -6,10 +6,9 @@ an example. A search that went wrong gives none of the object, so that the true 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import PATCH_PX, cut_patch
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, Episode, EpisodeMaker, EpisodesConfig
+from qsgm.train.processes import InTurn
 
 Image = NDArray[np.uint8]
 # (frame) -> heatmap
@@ -53,14 +53,6 @@ class OfOneObject:
     taught: Image  # (64, 64, 3)
     solid: Image  # (64, 64)
     views: tuple[tuple[Image, bool], ...]  # (64, 64, 3) each, and whether it is the object
-
-
-class InTurn(Protocol):
-    """What :func:`map` does, here or in other processes."""
-
-    def __call__(
-        self, work: Callable[[int], OfOneObject], numbers: Iterable[int], /
-    ) -> Iterator[OfOneObject]: ...
 
 
 def draw_examples(

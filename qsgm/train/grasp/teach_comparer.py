@@ -1,12 +1,8 @@
 """`qsgm teach-comparer`: a comparer, from drawn objects that an untouched network looks for."""
 
 import json
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
-
-import torch
 
 from qsgm.files import new_file
 from qsgm.grasp.task import grasp_task
@@ -19,6 +15,7 @@ from qsgm.train.grasp.episodes import EpisodesConfig
 from qsgm.train.model.fold import folded_start
 from qsgm.train.pretraining.pretrain import PretrainConfig, check_device
 from qsgm.train.pretraining.tasks import start_states
+from qsgm.train.processes import in_processes
 
 DRAWN = EpisodesConfig(3799)
 
@@ -53,9 +50,8 @@ def teach_comparer(
     look = _untouched(checkpoint_path)
     with new_file(output) as new:
         count = counted(watch, "examples", drawn.episodes)
-        spawned, one_thread = get_context("spawn"), (torch.set_num_threads, (1,))
-        with ProcessPoolExecutor(processes, spawned, *one_thread) as pool:
-            examples = draw_examples(look, drawn, seed, count, pool.map)
+        with in_processes(processes) as in_turn:
+            examples = draw_examples(look, drawn, seed, count, in_turn)
         comparer = train_comparer(examples, config, seed, device, watch)
         new.write_text(json.dumps(comparer.to_json()) + "\n", encoding="ascii")
 

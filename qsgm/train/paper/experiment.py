@@ -8,7 +8,7 @@ from qsgm.train.paper.objects import OBJECTS, ObjectCrops, cut_object
 from qsgm.train.paper.pretraining import PretrainingSizes, pretrain_without
 from qsgm.train.paper.systems import RATES, all_systems, tune_object
 from qsgm.train.pretraining.evaluate import Score
-from qsgm.train.pretraining.pretrain import one_thread
+from qsgm.train.processes import one_thread
 
 Scores = tuple[float, float, float]  # objective, detection accuracy, angle error [deg]
 

@@ -16,8 +16,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
@@ -63,6 +62,7 @@ from qsgm.train.pretraining.rates import (
 from qsgm.train.pretraining.recipes import choose_recipes, late_runs
 from qsgm.train.pretraining.resume import Partial
 from qsgm.train.pretraining.tasks import TaskSet, draw_tasks
+from qsgm.train.processes import one_thread
 from qsgm.train.task import DrawnTask
 
 SAVE_EVERY = 100
@@ -211,17 +211,6 @@ def _learn(
     rates, found = _choose_rates(net, rule, task, config, seed, watch)
     rule = replace(rule, rates=found.rates[late])
     return Learnt(net, first, rule, rates, found)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread: thousands of tiny operations only wait for a second one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _identity(

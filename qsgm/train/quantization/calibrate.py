@@ -11,6 +11,7 @@ most nearly where the float ones do.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from qsgm.progress import Progress
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, SgmRanges, integer_forward, quantize_sgm
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
+from qsgm.train.processes import InTurn
 from qsgm.train.quantization.calibration_runs import (
     EPOCHS,
     Look,
@@ -65,6 +67,7 @@ def calibrate(
     epochs: int = EPOCHS,
     calibrator: str = AUTO,
     activation_bits: ActivationBits = 16,
+    in_turn: InTurn = map,
 ) -> Calibration:
     """Fine-tune on every frame with the float SGMs and take each SGM's ranges on the way.
 
@@ -81,19 +84,19 @@ def calibrate(
         calibrator: one of :data:`qsgm.sgm.ranges.CALIBRATORS`, or :data:`AUTO`: for each layer
             the one that does best on frames held out.
         activation_bits: of the int8 SGMs.
+        in_turn: goes through the frames.
 
     Raises:
         QsgmError: there is no such calibrator, a run diverged, or a frame cannot be used.
     """
     refuse_unknown(calibrator)
     held_out = held_out_frames(len(lessons)) if calibrator == AUTO else range(0)
-    looks: Looks = {}
-    everything, compared = observe(trainee, lessons, seed, watch, epochs, held_out, looks)
+    everything, compared, looks = observe(trainee, lessons, seed, watch, epochs, held_out, in_turn)
     levels = 2**activation_bits
     if calibrator == AUTO:
         candidates = quantize_all(trainee, compared, activation_bits)
         judges = held_out or range(len(lessons))
-        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs, looks)
+        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs, looks, in_turn)
         chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
     else:
         cosines = {layer: {} for layer in trainee.sgms}
@@ -125,34 +128,29 @@ def observe(
     watch: Progress,
     epochs: int,
     held_out: range,
-    looks: Looks,
-) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers]]:
-    """What each SGM sees in the runs on all frames, and on those that are not held out.
-
-    `looks` are added to.
-    """
+    in_turn: InTurn,
+) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers], Looks]:
+    """What each SGM sees in the runs on all frames, and on those that are not held out; looks."""
     everything, compared = (
         {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
     )
-    for i in range(len(lessons)):
-        watch("calibrate", i, len(lessons))
-        for layer, seen in observe_lesson(trainee, lessons, i, seed, epochs, looks).items():
+    watch("calibrate", 0, len(lessons))
+    work, looks = partial(observe_lesson, trainee, lessons, seed, epochs), Looks()
+    for i, (observers, kept) in enumerate(in_turn(work, range(len(lessons)))):
+        for layer, seen in observers.items():
             everything[layer].merge(seen)
             if i not in held_out:
                 compared[layer].merge(seen)
-    watch("calibrate", len(lessons), len(lessons))
-    return everything, compared
+        if kept:
+            looks[i] = kept
+        watch("calibrate", i + 1, len(lessons))
+    return everything, compared, looks
 
 
 def observe_lesson(
-    trainee: Trainee,
-    lessons: Lessons,
-    i: int,
-    seed: int,
-    epochs: int,
-    looks: Looks | None = None,
-) -> dict[int, SgmObservers]:
-    """What each SGM sees in the runs on one lesson; `looks` are added to."""
+    trainee: Trainee, lessons: Lessons, seed: int, epochs: int, i: int
+) -> tuple[dict[int, SgmObservers], list[Look]]:
+    """What each SGM sees in the runs on one lesson, and looks at the run with maps."""
     kept = list[Look]()
     observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
     for plan in run_plans(trainee.network, trainee.checkpoint.most_layers, epochs):
@@ -167,9 +165,7 @@ def observe_lesson(
         for done, moment in enumerate(run(trainee, lesson, plan, [seed, i], gradient)):
             if plan.maps and done % plan.measure_every == 0:
                 kept.append(Look.at(moment))
-    if looks is not None and kept:
-        looks[i] = kept
-    return observers
+    return observers, kept
 
 
 def quantize_all(
@@ -197,6 +193,7 @@ def judge(
     watch: Progress,
     epochs: int,
     looks: Looks,
+    in_turn: InTurn,
 ) -> dict[int, dict[str, float]]:
     """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.
 
@@ -205,16 +202,33 @@ def judge(
     cosines: dict[int, dict[str, list[float]]] = {
         layer: {name: [] for name in CALIBRATORS} for layer in candidates
     }
-    for done, i in enumerate(judges):
+    watch("choose", 0, len(judges))
+    work = partial(judge_lesson, trainee, candidates, lessons, seed, epochs, looks)
+    for done, found in enumerate(in_turn(work, judges), start=1):
+        for layer, name, value in found:
+            cosines[layer][name].append(value)
         watch("choose", done, len(judges))
-        for plan in measured_plans(trainee, epochs):
-            for layer, name, value in judge_run(trainee, candidates, lessons, i, plan, seed, looks):
-                cosines[layer][name].append(value)
-    watch("choose", len(judges), len(judges))
     return {
         layer: {name: float(np.mean(values)) for name, values in by_name.items()}
         for layer, by_name in cosines.items()
     }
+
+
+def judge_lesson(
+    trainee: Trainee,
+    candidates: Candidates,
+    lessons: Lessons,
+    seed: int,
+    epochs: int,
+    looks: Looks,
+    i: int,
+) -> list[tuple[int, str, float]]:
+    """Every calibrator's cosines in the runs on one lesson."""
+    return [
+        found
+        for plan in measured_plans(trainee, epochs)
+        for found in judge_run(trainee, candidates, lessons, i, plan, seed, looks)
+    ]
 
 
 def judge_run(

@@ -1,6 +1,7 @@
 """How faithful int8 SGMs are along whole fine-tuning runs on the calibration set."""
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from qsgm.progress import Progress
 from qsgm.sgm.float import FloatArray
 from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
 from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
+from qsgm.train.processes import InTurn
 from qsgm.train.quantization.calibration_runs import (
     EPOCHS,
     Looks,
@@ -35,6 +37,7 @@ def measure(
     watch: Progress,
     epochs: int = EPOCHS,
     looks: Looks = NO_LOOKS,
+    in_turn: InTurn = map,
 ) -> dict[int, LayerFidelity]:
     """Fidelity of each int8 SGM, mean over runs on every frame.
 
@@ -44,13 +47,30 @@ def measure(
     calibration's `looks` at them can be looked at again.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
-    for i in range(len(lessons)):
-        watch("measure", i, len(lessons))
-        for plan in measured_plans(trainee, epochs):
-            for layer, fidelity in measure_run(trainee, int8_sgms, lessons, i, plan, seed, looks):
-                measured[layer].append(fidelity)
-    watch("measure", len(lessons), len(lessons))
+    watch("measure", 0, len(lessons))
+    work = partial(measure_lesson, trainee, int8_sgms, lessons, seed, epochs, looks)
+    for done, found in enumerate(in_turn(work, range(len(lessons))), start=1):
+        for layer, fidelity in found:
+            measured[layer].append(fidelity)
+        watch("measure", done, len(lessons))
     return {layer: mean_over_run(values) for layer, values in measured.items()}
+
+
+def measure_lesson(
+    trainee: Trainee,
+    int8_sgms: Mapping[int, QuantizedSgm],
+    lessons: Lessons,
+    seed: int,
+    epochs: int,
+    looks: Looks,
+    i: int,
+) -> list[tuple[int, LayerFidelity]]:
+    """What each SGM is worth in the runs on one lesson."""
+    return [
+        found
+        for plan in measured_plans(trainee, epochs)
+        for found in measure_run(trainee, int8_sgms, lessons, i, plan, seed, looks)
+    ]
 
 
 def measure_run(
