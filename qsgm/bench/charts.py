@@ -113,7 +113,7 @@ def learning_curves(values: Mapping[str, Any]) -> "Figure":
     Lines follow the main run; dots are where runs end, those of the shorter ones included, whose
     rates decay faster.
     """
-    margins = {"left": 0.04, "right": 0.86, "top": 0.925, "bottom": 0.275, "wspace": 0.5}
+    margins = {"left": 0.04, "right": 0.85, "top": 0.925, "bottom": 0.275, "wspace": 0.5}
     figure = new_page((9.0, 4.5), 1, 2, **margins)
     left, right = figure.axes
     runs = values["runs"]

@@ -89,7 +89,7 @@ class CalibrationLessons:
         return hashlib.sha256(self.frames.manifest_bytes).hexdigest()
 
     def lesson(self, i: int, rng: np.random.Generator, count: int) -> GraspLesson:
-        """Crops of a frame, nothing put on them."""
+        """Crops of a frame, with other things on them as the device has them."""
         shown = self.frames[i]
         return frame_lesson(shown.frame, rng, count, self.task, shown.center_px)
 

@@ -19,7 +19,7 @@ from qsgm.train.grasp.comparer_examples import Look
 from qsgm.train.grasp.decision import JudgedScene, Weighed
 from qsgm.train.grasp.drawing.scenes import DrawnScene
 from qsgm.train.grasp.episodes import CENTER_PX, Episode, EpisodesConfig
-from qsgm.train.grasp.task import DrawnGrasping, frame_lesson, shipped_things
+from qsgm.train.grasp.task import DrawnGrasping, frame_lesson
 from qsgm.train.heads import activate
 from qsgm.train.model.local import LayerState
 from qsgm.train.model.net import ConvNet, normalize
@@ -101,7 +101,7 @@ def _task(
 ) -> SeenLesson:
     rng, frame = np.random.default_rng(seed), episode.demonstration.image
     assert isinstance(rule.task, DrawnGrasping), "scenes are drawn of objects to grasp"
-    lesson = frame_lesson(frame, rng, config.crops, rule.task, things=shipped_things())
+    lesson = frame_lesson(frame, rng, config.crops, rule.task)
     return see_lesson(net, lesson, net.network.depth - tuned, rule.task)
 
 

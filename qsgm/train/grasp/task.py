@@ -37,7 +37,7 @@ class DrawnGrasping(GraspTask):
         return cut_crops(drawn.image, plan), labels
 
     def lesson(self, rng: np.random.Generator, count: int) -> GraspLesson:
-        """The crops of one drawn frame, nothing put on them."""
+        """The crops of one drawn frame, with other things on them as the device has them."""
         return frame_lesson(draw_frame(rng).image, rng, count, self)
 
 
@@ -47,13 +47,12 @@ def frame_lesson(
     count: int,
     task: GraspTask,
     center_px: tuple[float, float] = CENTER_PX,
-    things: Distractors | None = None,
 ) -> GraspLesson:
-    """Crops of one demonstration (H, W, 3), all of which say how it lies.
+    """Crops of one demonstration (H, W, 3), with other things on them as the device has them.
 
-    `things` are put on crops as the device does it; None: the frame is all there is.
+    All of them say how it lies: none is held out.
     """
-    crops = crop_source([Demonstration(frame, center_px)], things, rng, count)
+    crops = crop_source([Demonstration(frame, center_px)], shipped_things(), rng, count)
     return GraspLesson(crops, task.encoding, taught=count)
 
 
