@@ -209,8 +209,14 @@ def test_the_comparison_goes_on_where_it_stopped_and_prints_a_table(
         "float SGMs",
         "backpropagation at its best",
         "neighbours",
+        "errors over backpropagation's",
     ):
         assert row in first
+
+
+def test_errors_over_those_of_who_made_none_are_no_number() -> None:
+    assert comparing().quotient(np.array([0.9, 0.7]), np.array([1.0, 1.0])) == "-"
+    assert comparing().quotient(np.array([0.9, 0.7]), np.array([0.9, 0.9])) == "2.00"
 
 
 def test_of_a_grid_each_person_gets_what_is_best_for_the_others() -> None:

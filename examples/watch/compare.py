@@ -202,12 +202,17 @@ def print_beside(grids, epochs):
     default = grids["int8 SGMs, the bundle's rates", epochs][""][:, -1]
     chosen = chosen_by_others(of_bp, -1)
     best = max((one[:, -1] for one in of_bp.values()), key=np.mean)
-    ratios = [(1 - default).mean() / (1 - one).mean() for one in (chosen, best)]
     print(
-        f"{epochs:>2} epochs: errors over backpropagation's {ratios[0]:.2f} (at its best "
-        f"{ratios[1]:.2f}), more by {interval(chosen - default)}; right more often than untouched "
-        f"by {interval(default - untouched)}"
+        f"{epochs:>2} epochs: errors over backpropagation's {quotient(default, chosen)}"
+        f" (at its best {quotient(default, best)}), more by {interval(chosen - default)};"
+        f" right more often than untouched by {interval(default - untouched)}"
     )
+
+
+def quotient(right, others):
+    """Errors over others', who may have made none."""
+    wrong = (1 - others).mean()
+    return f"{(1 - right).mean() / wrong:.2f}" if wrong else "-"
 
 
 def interval(differences):
