@@ -18,8 +18,8 @@ from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.evidence import NAMES
 
 Floats = NDArray[np.float32]
-# Of drawn scenes without the object. In photographs two to three times as many are raised.
-FALSE_ALARM_RATE = 0.01
+# Of drawn scenes without the object. In photographs some five times as many are raised.
+FALSE_ALARM_RATE = 0.005
 MOST_HIDDEN = 256
 # What the comparer says, behind all other evidence.
 COMPARED = "compared"
