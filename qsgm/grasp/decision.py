@@ -18,7 +18,7 @@ from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.evidence import NAMES
 
 Floats = NDArray[np.float32]
-# Of drawn scenes without the object. In photographs some five times as many are raised.
+# Of drawn scenes without the object. In photographs some four times as many are raised.
 FALSE_ALARM_RATE = 0.005
 MOST_HIDDEN = 256
 # What the comparer says, behind all other evidence.

@@ -31,7 +31,7 @@ from qsgm.train.pretraining.tasks import SeenLesson, TaskSet, see_lesson
 class DecisionScenesConfig(EpisodesConfig):
     """How many objects and scenes the decision is made on, and how each object is taught."""
 
-    episodes: int = 480  # of half as many the threshold is off by a third of its log odds
+    episodes: int = 480  # half as many leave the threshold uncertain by 0.36 of log odds
     crops: int = 1000
     support: int = 800
     epochs: int = 20
