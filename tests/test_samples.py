@@ -3,13 +3,13 @@
 import io
 import json
 import zipfile
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refusal_of
 
 from qsgm import (
     Head,
@@ -49,15 +49,6 @@ def saved(path: Path, **arrays: Any) -> Path:
     return path
 
 
-def refused(call: Callable[[], object]) -> str:
-    with pytest.raises(QsgmError) as caught:
-        call()
-    message = str(caught.value)
-    assert message
-    assert "\n" not in message
-    return message
-
-
 def test_classes_and_labels_are_the_same_samples(tmp_path: Path) -> None:
     classes = np.arange(10) % 3
     one = TASK.read(saved(tmp_path / "a.npz", samples=inputs(), labels=classes))
@@ -86,7 +77,7 @@ def test_only_whole_numbers_in_a_row_are_classes(
     tmp_path: Path, labels: np.ndarray[Any, Any]
 ) -> None:
     path = saved(tmp_path / "a.npz", samples=inputs(), labels=labels)
-    said = refused(lambda: TASK.read(path))
+    said = refusal_of(lambda: TASK.read(path))
     assert f"labels are {labels.dtype} {labels.shape}, expected float32 (10, 3)" in said
 
 
@@ -117,7 +108,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
     tmp_path: Path, arrays: dict[str, Any], said: str
 ) -> None:
     path = saved(tmp_path / "bad.npz", **arrays)
-    message = refused(lambda: TASK.read(path))
+    message = refusal_of(lambda: TASK.read(path))
     assert said in message
     assert "bad.npz" in message
 
@@ -133,14 +124,14 @@ def test_an_archive_that_says_more_than_it_holds_is_refused_before_it_is_unpacke
     path = tmp_path / "large.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("samples.npy", header.getvalue() + bytes(24))
-    assert "which is not in it" in refused(lambda: TASK.read(path))
+    assert "which is not in it" in refusal_of(lambda: TASK.read(path))
 
 
 @pytest.mark.parametrize("cut", [0, 10, 200])
 def test_a_damaged_archive_is_refused(tmp_path: Path, cut: int) -> None:
     path = saved(tmp_path / "cut.npz", samples=inputs())
     path.write_bytes(path.read_bytes()[:cut])
-    assert "cannot be read" in refused(lambda: TASK.read(path))
+    assert "cannot be read" in refusal_of(lambda: TASK.read(path))
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -158,11 +149,11 @@ def test_a_fifth_of_the_samples_is_held_out_and_all_are_there() -> None:
     lesson = lesson_of(TASK, [Samples(inputs(), labels)], np.random.default_rng(1))
     assert (len(lesson), lesson.taught) == (10, 8)
     assert sorted(lesson.inputs.ravel()) == sorted(inputs().ravel())
-    assert "need labels" in refused(
+    assert "need labels" in refusal_of(
         lambda: lesson_of(TASK, [Samples(inputs())], np.random.default_rng(1))
     )
     one = Samples(inputs(1), labels[:1])
-    assert "1 sample" in refused(lambda: lesson_of(TASK, [one], np.random.default_rng(1)))
+    assert "1 sample" in refusal_of(lambda: lesson_of(TASK, [one], np.random.default_rng(1)))
 
 
 def test_scores_go_by_the_names_of_heads_and_count_where_a_head_counts() -> None:
@@ -183,8 +174,8 @@ def test_a_task_file_is_read_and_its_classes_are_found_again(tmp_path: Path) -> 
     path.write_text(FILE)
     task = load_task(path)
     assert (task.name, task.network, task.heads) == ("mine", NETWORK, HEADS)
-    assert "how x.npz is read" in refused(lambda: task.read(Path("x.npz")))
-    assert "nothing to pretrain on" in refused(lambda: task.draw(np.random.default_rng(0), 1))
+    assert "how x.npz is read" in refusal_of(lambda: task.read(Path("x.npz")))
+    assert "nothing to pretrain on" in refusal_of(lambda: task.draw(np.random.default_rng(0), 1))
 
 
 @pytest.mark.parametrize(
@@ -208,15 +199,15 @@ def test_a_task_file_that_is_none_is_refused_in_one_line(
     path = tmp_path / "bad.py"
     if source is not None:
         path.write_text(source)
-    assert said in refused(lambda: load_task(path))
+    assert said in refusal_of(lambda: load_task(path))
 
 
 def test_a_task_file_of_more_than_a_megabyte_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "long.py"
     path.write_text("#" * 999_999 + "\n")
-    assert "`task` is nothing" in refused(lambda: load_task(path))  # it was run
+    assert "`task` is nothing" in refusal_of(lambda: load_task(path))  # it was run
     path.write_text("#" * 1_000_000 + "\n")
-    assert "at most 1 MB" in refused(lambda: load_task(path))
+    assert "at most 1 MB" in refusal_of(lambda: load_task(path))
 
 
 def test_what_a_task_file_raises_while_it_reads_is_one_line() -> None:
@@ -228,9 +219,9 @@ def test_what_a_task_file_raises_while_it_reads_is_one_line() -> None:
         def read(self, path: Path) -> Any:  # noqa: ARG002
             return None
 
-    message = refused(lambda: read_samples(Wrong("mine", NETWORK, HEADS), Path("a.npz")))
+    message = refusal_of(lambda: read_samples(Wrong("mine", NETWORK, HEADS), Path("a.npz")))
     assert "the task 'mine' cannot read a.npz: KeyError in line" in message
-    message = refused(lambda: read_samples(Empty("mine", NETWORK, HEADS), Path("a.npz")))
+    message = refusal_of(lambda: read_samples(Empty("mine", NETWORK, HEADS), Path("a.npz")))
     assert "a.npz gives a NoneType, expected qsgm.Samples" in message
 
 
@@ -238,11 +229,11 @@ def test_another_tasks_file_is_refused_and_so_is_none() -> None:
     kept = TaskRecord("mine", NETWORK, HEADS, {})
     mine, yours = SampleTask("mine", NETWORK, HEADS), SampleTask("yours", NETWORK, HEADS)
     assert task_for(kept, "it", mine) is mine
-    assert "pass --task FILE.py" in refused(lambda: task_for(kept, "it", None))
-    assert "the task file of 'yours'" in refused(lambda: task_for(kept, "it", yours))
+    assert "pass --task FILE.py" in refusal_of(lambda: task_for(kept, "it", None))
+    assert "the task file of 'yours'" in refusal_of(lambda: task_for(kept, "it", yours))
     heads = (Head("other", "cross_entropy", 3, "softmax"),)
     other = SampleTask("mine", NETWORK, heads)
-    assert "another network or other heads" in refused(lambda: task_for(kept, "it", other))
+    assert "another network or other heads" in refusal_of(lambda: task_for(kept, "it", other))
     built_in = task_for(task_record(TASK), "it", None)
     assert isinstance(built_in, ArraysTask)
     assert built_in.heads == HEADS
@@ -266,7 +257,7 @@ def test_a_pool_of_arrays_is_drawn_group_by_group(tmp_path: Path) -> None:
     halves = [set(inputs()[:5].ravel()), set(inputs()[5:].ravel())]
     assert all(any(set(one.ravel()) <= half for half in halves) for one in drawn)
     path.write_text("{}")
-    assert "is no task `arrays`" in refused(lambda: load_arrays_task(path))
+    assert "is no task `arrays`" in refusal_of(lambda: load_arrays_task(path))
 
 
 def test_of_recordings_the_ends_are_held_out_and_no_window_reaches_from_one_part_to_another() -> (
@@ -290,12 +281,12 @@ def test_a_recording_without_labels_or_of_too_few_windows_is_refused_in_one_line
     task = RecordedTask("mine", NETWORK, HEADS, overlap=2)
     few, enough = (Samples(inputs(count), labels(np.arange(count))) for count in (3, 4))
     assert task.lesson([enough], np.random.default_rng(0)).taught == 1
-    said = refused(lambda: task.lesson([enough, few], RNG))
+    said = refusal_of(lambda: task.lesson([enough, few], RNG))
     assert "has 3 windows, expected labelled ones, more than the last fifth" in said
     assert "and 2 before it" in said
     unlabelled = Samples(enough.inputs)
-    assert "has no labels" in refused(lambda: task.lesson([enough, unlabelled], RNG))
-    assert "nothing was shown" in refused(lambda: task.lesson([], RNG))
+    assert "has no labels" in refusal_of(lambda: task.lesson([enough, unlabelled], RNG))
+    assert "nothing was shown" in refusal_of(lambda: task.lesson([], RNG))
 
 
 def labels(numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

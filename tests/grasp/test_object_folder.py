@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refusal_of
 from toy_objects import MUG, described
 from toys import by_correlation
 
@@ -23,10 +24,7 @@ from qsgm.tuned_folder import DESCRIPTION, REPORT
 
 
 def refusal(folder: Path) -> str:
-    with pytest.raises(QsgmError) as raised:
-        load_object(folder)
-    assert "\n" not in str(raised.value)
-    return str(raised.value)
+    return refusal_of(load_object, folder)
 
 
 def test_an_object_reads_back_as_it_was_written(saved: Path) -> None:
