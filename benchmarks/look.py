@@ -27,8 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 from qsgm.bench.composing import Composer
+from qsgm.bench.frames import spread
 from qsgm.bench.scenes import ScenePlan
-from qsgm.bench.subjects import drawn_subjects, spread
+from qsgm.bench.subjects import drawn_subjects
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.grasp.heatmap import Detection
 from qsgm.grasp.teach import prepare_object, train_object

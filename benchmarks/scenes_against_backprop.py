@@ -18,10 +18,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from qsgm.bench.frames import list_frames
+from qsgm.bench.frames import list_frames, spread
 from qsgm.bench.judging import Tally, paired_difference
 from qsgm.bench.scenes import MethodResults, ScenePlan, TunedMethod, measure_scenes
-from qsgm.bench.subjects import drawn_subjects, spread, subjects_of
+from qsgm.bench.subjects import drawn_subjects, subjects_of
 from qsgm.bundle import Bundle, load_bundle
 from qsgm.manifest import Recipe
 from qsgm.tune.settings import Settings

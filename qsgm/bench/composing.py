@@ -79,10 +79,6 @@ class ScenePair:
     absent: Scene
 
     @property
-    def condition(self) -> Condition:
-        return self.present.condition
-
-    @property
     def absent_thing(self) -> bool:
         """Whether another thing lies where the object was."""
         return self.absent.thing_instead

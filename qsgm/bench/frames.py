@@ -70,9 +70,13 @@ def list_frames(folder: Path, limit: int | None = None) -> list[BenchFrame]:
     frames = _from_manifest(folder, manifest) if manifest.is_file() else _from_pictures(folder)
     if not frames:
         raise QsgmError(f"--frames {folder}: expected PNG or JPEG frames in it, found none")
-    if limit is None or limit >= len(frames):
-        return frames
-    return [frames[i * len(frames) // limit] for i in range(limit)]
+    return [frames[i] for i in spread(len(frames), limit)]
+
+
+def spread(count: int, limit: int | None) -> list[int]:
+    """At most `limit` of `count` numbers, evenly spread."""
+    some = count if limit is None else min(limit, count)
+    return [i * count // some for i in range(some)]
 
 
 def groups_of(frames: Sequence[BenchFrame]) -> dict[str, list[int]]:

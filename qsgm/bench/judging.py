@@ -166,10 +166,6 @@ class Tally:
             self.found[which], self.quality[which], self.on_object[which], self.on_thing[which]
         )
 
-    def above(self, threshold: float) -> "Tally":
-        """The same guesses, found where their quality is above the threshold."""
-        return Tally(self.quality > threshold, self.quality, self.on_object, self.on_thing)
-
     @property
     def right(self) -> Flags:
         """Pairs (n,) whose object was found in its right place."""
@@ -244,11 +240,11 @@ def equal_error_rate(positives: Numbers, negatives: Numbers) -> float:
     return float(alarms[i - 1] + part * (alarms[i] - alarms[i - 1]))
 
 
-def threshold_for(negatives: Numbers, rate: float = FALSE_ALARM_RATE) -> float:
-    """The lowest threshold above which at most this share of the negatives lies."""
+def threshold_for(negatives: Numbers) -> float:
+    """The lowest threshold above which at most 2 % of the negatives lie."""
     if not len(negatives):
         return math.inf
-    allowed = min(int(rate * len(negatives) + 1e-9), len(negatives) - 1)
+    allowed = min(int(FALSE_ALARM_RATE * len(negatives) + 1e-9), len(negatives) - 1)
     return float(np.sort(negatives)[::-1][allowed])
 
 
@@ -268,14 +264,14 @@ def intervals(
 
 
 def paired_difference(
-    first: Flags | Numbers, second: Flags | Numbers, seed: int, resamples: int = RESAMPLES
+    first: Flags | Numbers, second: Flags | Numbers, seed: int
 ) -> tuple[float, tuple[float, float]]:
     """Mean of first - second over the same n scenes, with its bootstrap 95 % interval."""
     if first.shape != second.shape or not len(first):
         raise ValueError(f"expected equally many scenes, got {first.shape} and {second.shape}")
     difference = first.astype(float) - second.astype(float)
     rng = np.random.default_rng(seed)
-    rows = (rng.integers(len(difference), size=len(difference)) for _ in range(resamples))
+    rows = (rng.integers(len(difference), size=len(difference)) for _ in range(RESAMPLES))
     return float(difference.mean()), _middle_95([difference[row].mean() for row in rows])
 
 

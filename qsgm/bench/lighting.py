@@ -1,7 +1,7 @@
 """Light and camera of a scene: brightness, tint, slope, contrast, blur, noise."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,9 +41,7 @@ def blurred_camera(rng: np.random.Generator) -> Camera:
     """Mild light, out of focus or moving."""
     camera = mild_camera(rng)
     kernel = _defocus(rng) if rng.random() < 0.5 else _motion(rng)
-    return Camera(
-        camera.gain, camera.gamma, camera.slope, camera.from_side_rad, camera.noise_seed, kernel
-    )
+    return replace(camera, kernel=kernel)
 
 
 def photograph(scenes: Sequence[Floats], camera: Camera) -> list[Frame]:

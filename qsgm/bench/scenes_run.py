@@ -1,16 +1,16 @@
 """The command `qsgm bench scenes`: subjects in, every method's answers, report and pictures out."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qsgm.bench.composing import Condition
-from qsgm.bench.frames import list_frames
+from qsgm.bench.composing import CONDITIONS
+from qsgm.bench.frames import list_frames, spread
 from qsgm.bench.rivals import Rival, keep_scenes
 from qsgm.bench.scenes import Method, ScenePlan, TunedMethod, measure_scenes
 from qsgm.bench.scenes_picture import Album, draw_scenes
 from qsgm.bench.scenes_report import report_json
-from qsgm.bench.subjects import drawn_subjects, spread, subjects_of
+from qsgm.bench.subjects import drawn_subjects, subjects_of
 from qsgm.bundle import Bundle
 from qsgm.files import write_text_atomic
 from qsgm.images import write_png
@@ -19,41 +19,44 @@ from qsgm.tables import to_json
 from qsgm.tune.settings import Settings
 
 
-@dataclass(frozen=True)
-class SceneJob:
-    """What the command was asked for."""
-
-    frames: Path | None  # None: drawn subjects
-    limit: int | None
-    conditions: tuple[Condition, ...]
-    count: int
-    settings: Settings
-    bundle: Bundle
-    rivals: tuple[Rival, ...] = ()
-    keep: Path | None = None
-    output: Path | None = None
-
-
-def run_scenes(job: SceneJob, watch: Progress) -> dict[str, Any]:
+def run_scenes(
+    frames: Path | None,
+    limit: int | None,
+    conditions: Sequence[str],
+    count: int,
+    settings: Settings,
+    bundle: Bundle,
+    rivals: Sequence[Rival],
+    keep: Path | None,
+    output: Path | None,
+    watch: Progress,
+) -> dict[str, Any]:
     """The report's JSON; picture, JSON and some of what went wrong are written where asked for.
+
+    Args:
+        frames: a folder of demonstrations with masks; None: drawn subjects.
+        limit: of the subjects that are looked for.
+        count: of pairs, for each subject and condition.
+        keep: folder for all scenes and the truth.
+        output: folder for report and pictures.
 
     Raises:
         QsgmError: the frames, the bundle or a rival cannot be used.
     """
-    seed = job.settings.seed
-    subjects = drawn_subjects(seed) if job.frames is None else subjects_of(list_frames(job.frames))
-    taught = spread(len(subjects), job.limit)
-    plan = ScenePlan(tuple(subjects), tuple(taught), job.conditions, job.count, seed)
-    if job.keep is not None:
-        keep_scenes(plan, job.keep, watch)
+    subjects = drawn_subjects(settings.seed) if frames is None else subjects_of(list_frames(frames))
+    taught = spread(len(subjects), limit)
+    asked = tuple(name for name in CONDITIONS if name in conditions)
+    plan = ScenePlan(tuple(subjects), tuple(taught), asked, count, settings.seed)
+    if keep is not None:
+        keep_scenes(plan, keep, watch)
     album = Album(tuple(subjects[number].name for number in taught))
-    methods: list[Method] = [TunedMethod("qsgm", job.bundle, job.settings), *job.rivals]
-    results = measure_scenes(plan, methods, watch, None if job.output is None else album.look)
-    source = "drawn" if job.frames is None else str(job.frames)
-    values = report_json(plan, job.settings, job.bundle.folder, source, results)
-    if job.output is not None:
-        write_text_atomic(job.output / "scenes.json", to_json(values) + "\n")
-        write_png(job.output / "scenes.png", draw_scenes(values, album))
+    methods: list[Method] = [TunedMethod("qsgm", bundle, settings), *rivals]
+    results = measure_scenes(plan, methods, watch, None if output is None else album.look)
+    source = "drawn" if frames is None else str(frames)
+    values = report_json(plan, settings, bundle.folder, source, results)
+    if output is not None:
+        write_text_atomic(output / "scenes.json", to_json(values) + "\n")
+        write_png(output / "scenes.png", draw_scenes(values, album))
         for name, picture in album.failures.items():
-            write_png(job.output / "failures" / f"{name}.png", picture)
+            write_png(output / "failures" / f"{name}.png", picture)
     return values

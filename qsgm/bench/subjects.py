@@ -41,10 +41,3 @@ def drawn_subjects(seed: int, count: int = DRAWN_SUBJECTS) -> list[Subject]:
         elongated = drawn.elongation >= LEAST_ELONGATION
         subjects.append(Subject(f"{kind}_{i:02}", kind, drawn.image, drawn.mask, elongated))
     return subjects
-
-
-def spread(count: int, limit: int | None) -> list[int]:
-    """At most `limit` of `count` numbers, evenly spread."""
-    if limit is None or limit >= count:
-        return list(range(count))
-    return [i * count // limit for i in range(limit)]

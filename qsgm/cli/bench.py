@@ -40,18 +40,10 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Measure what the pages in docs/ state.")
 
 
-class SceneCondition(StrEnum):
-    """What is different in a scene."""
-
-    SAME_TABLE = "same_table"
-    ANOTHER_TABLE = "another_table"
-    BESIDE = "beside"
-    EDGES = "edges"
-    SCALE = "scale"
-    TILT = "tilt"
-    HALF_LIGHT = "half_light"
-    BLUR = "blur"
-    HIDDEN = "hidden"
+# What is different in a scene: `qsgm.bench.composing.CONDITIONS`, which takes numpy to load.
+SceneCondition = StrEnum(
+    "SceneCondition", "same_table another_table beside edges scale tilt half_light blur hidden"
+)
 
 
 @app.command("accuracy")
@@ -151,17 +143,16 @@ def bench_scenes(
     scene with the object and without it. Rivals look at the same scenes; how they are called,
     `benchmarks/rivals` shows.
     """
-    from qsgm.bench.composing import CONDITIONS
     from qsgm.bench.scenes_report import render
-    from qsgm.bench.scenes_run import SceneJob, run_scenes
+    from qsgm.bench.scenes_run import run_scenes
 
-    parsed = tuple(parsed_rival(text) for text in rivals or [])
+    parsed = [parsed_rival(text) for text in rivals or []]
     settings = settings_of(int8, method, layers, optimizer, epochs, seed, threads)
-    loaded = open_bundle(bundle)
-    asked = tuple(name for name in CONDITIONS if name in (conditions or CONDITIONS))
-    job = SceneJob(frames, limit, asked, scenes, settings, loaded, parsed, keep, output)
+    loaded, asked = open_bundle(bundle), conditions or [*SceneCondition]
     with progress() as watch:
-        values = run_scenes(job, watch)
+        values = run_scenes(
+            frames, limit, asked, scenes, settings, loaded, parsed, keep, output, watch
+        )
     show(values, render(values), as_json)
 
 

@@ -30,7 +30,6 @@ TILE_PX = 128
 MOST_TILES_A_SIDE = 16
 UNIT_GAIN = 256
 GRAIN_PX = 192  # side of a grain tile; a crop's window starts anywhere in the first 65 x 65
-HALF_PLANES = 4
 _LEVELS = np.arange(256, dtype=np.int32)
 _FRACTION_BITS = 8  # of a half plane's coefficients
 

@@ -21,7 +21,8 @@ from qsgm.bench.composing import (
     kind_of,
 )
 from qsgm.bench.cutouts import cut_out
-from qsgm.bench.subjects import drawn_subjects, spread
+from qsgm.bench.frames import spread
+from qsgm.bench.subjects import drawn_subjects
 from qsgm.bench.surfaces import with_surface
 
 H, W = 240, 320
