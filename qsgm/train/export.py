@@ -62,7 +62,7 @@ from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sg
 from qsgm.train.model.net import as_seen
 from qsgm.train.processes import in_processes
 from qsgm.train.quantization.calibrate import AUTO, calibrate
-from qsgm.train.quantization.calibration_runs import EPOCHS, Trainee, prepare
+from qsgm.train.quantization.calibration_runs import EPOCHS, CalibrationRuns, Trainee, prepare
 from qsgm.train.quantization.lessons import Lessons
 from qsgm.train.quantization.sgm_fidelity import measure
 from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
@@ -122,14 +122,14 @@ def export_bundle(
     exported = exported_blocks(trainee.network, most, options.blocks, groups)
     fold_error = check_folding(trainee, lessons)
     trainee, int8_trunk = calibrate_trunk(trainee, lessons, watch)
+    runs = CalibrationRuns(trainee, lessons, options.epochs)
     with in_processes(options.processes) as in_turn:
-        epochs, calibrator = options.epochs, options.calibrator
-        calibration = calibrate(trainee, lessons, SEED, watch, epochs, calibrator, bits, in_turn)
+        calibration = calibrate(runs, watch, options.calibrator, bits, in_turn)
         int8_sgms = {
             k: quantize_sgm(sgm, calibration.ranges[k], bits) for k, sgm in trainee.sgms.items()
         }
-        looks = calibration.looks
-        fidelity = measure(trainee, int8_sgms, lessons, SEED, watch, epochs, looks, in_turn)
+        runs = replace(runs, looks=calibration.looks)
+        fidelity = measure(runs, int8_sgms, watch, in_turn)
     graphs = build_graphs(trainee, int8_sgms, int8_trunk, exported)
     for name, model in graphs.items():
         refuse_float_products(name, model)

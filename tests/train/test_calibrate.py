@@ -47,6 +47,7 @@ from qsgm.train.quantization.calibrate import (
     observe_lesson,
 )
 from qsgm.train.quantization.calibration_runs import (
+    CalibrationRuns,
     RunPlan,
     Trainee,
     one_position,
@@ -127,7 +128,7 @@ def test_ranges_are_those_of_every_step_of_every_run(folder: Path, trainee: Trai
             assert [len(moment.labels[0]) for moment in steps] == [32, 32, 6]
     stages: list[tuple[str, int, int]] = []
     watch = lambda *stage: stages.append(stage)  # noqa: E731
-    ranges = calibrate(trainee, frames, 0, watch, EPOCHS, "minmax").ranges
+    ranges = calibrate(CalibrationRuns(trainee, frames, EPOCHS), watch, "minmax").ranges
     assert stages == [("calibrate", done, 2) for done in (0, 1, 2)]
     assert [len(batches) for batches in seen.values()] == [6, 12]
     for layer, batches in seen.items():
@@ -153,8 +154,8 @@ def test_layers_move_during_a_run(folder: Path, trainee: Trainee) -> None:
 
 def test_a_frame_alone_gives_part_of_the_ranges(folder: Path, trainee: Trainee) -> None:
     frames = lessons_in(folder)
-    both = calibrate(trainee, frames, 0, ignore, EPOCHS, "minmax").ranges
-    alone, _ = observe_lesson(trainee, frames, 0, EPOCHS, 1)
+    both = calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, "minmax").ranges
+    alone, _ = observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), 1)
     for layer, observers in alone.items():
         ranges = observers.ranges("minmax", 256, LABELS)
         assert (ranges.input_low >= both[layer].input_low).all()
@@ -165,13 +166,13 @@ def test_two_processes_calibrate_and_measure_what_one_does(
     folder: Path, trainee: Trainee, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.undo()  # other processes know nothing of it
-    frames, found = lessons_in(folder), []
+    runs, found = CalibrationRuns(trainee, lessons_in(folder), EPOCHS), []
     for processes in (1, 2):
         with in_processes(processes) as in_turn:
-            done = calibrate(trainee, frames, 0, ignore, EPOCHS, in_turn=in_turn)
+            done = calibrate(runs, ignore, in_turn=in_turn)
             sgms = trainee.sgms.items()
             int8 = {layer: quantize_sgm(sgm, done.ranges[layer]) for layer, sgm in sgms}
-            fidelity = measure(trainee, int8, frames, 0, ignore, EPOCHS, in_turn=in_turn)
+            fidelity = measure(runs, int8, ignore, in_turn)
         found.append((done, fidelity))
     (one, one_fidelity), (two, two_fidelity) = found
     assert (one.chosen, one.cosines, one_fidelity) == (two.chosen, two.cosines, two_fidelity)
@@ -180,9 +181,9 @@ def test_two_processes_calibrate_and_measure_what_one_does(
 
 def test_int8_is_faithful_on_the_runs_it_was_calibrated_on(folder: Path, trainee: Trainee) -> None:
     frames = lessons_in(folder)
-    ranges = calibrate(trainee, frames, 0, ignore, EPOCHS, "minmax").ranges
+    ranges = calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, "minmax").ranges
     int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in trainee.sgms.items()}
-    fidelity = measure(trainee, int8, frames, 0, ignore, EPOCHS)
+    fidelity = measure(CalibrationRuns(trainee, frames, EPOCHS), int8, ignore)
     assert set(fidelity) == {4, 5}
     for layer in fidelity.values():
         assert layer.cos_int8_float > 0.999
@@ -217,12 +218,14 @@ def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
 ) -> None:
     draw_calibration_set(tmp_path / "calib", count=4, seed=3)
     frames = lessons_in(tmp_path / "calib")
-    result = calibrate(trainee, frames, 0, ignore, EPOCHS, activation_bits=8)
+    result = calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, activation_bits=8)
     assert result.held_out == 1
     # By hand: ranges from the first three frames, cosines along the runs on the fourth.
-    seen, _ = observe_lesson(trainee, frames, 0, EPOCHS, 0)
+    seen, _ = observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), 0)
     for i in (1, 2):
-        for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, i)[0].items():
+        for layer, observers in observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), i)[
+            0
+        ].items():
             seen[layer].merge(observers)
     inputs = []
 
@@ -242,7 +245,7 @@ def test_the_best_calibrator_on_held_out_frames_gives_the_ranges(
     assert [*result.cosines[4]] == [*CALIBRATORS]
     assert result.chosen == {k: best_calibrator(result.cosines[k]) for k in (4, 5)}
     # The frame held out has its part in the ranges all the same.
-    for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, 3)[0].items():
+    for layer, observers in observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), 3)[0].items():
         seen[layer].merge(observers)
         expected = seen[layer].ranges(result.chosen[layer], 256, LABELS)
         assert_same_ranges(result.ranges[layer], expected)
@@ -258,7 +261,7 @@ def assert_same_ranges(got: SgmRanges, expected: SgmRanges) -> None:
 def test_few_frames_judge_the_ranges_taken_from_them(folder: Path, trainee: Trainee) -> None:
     stages: list[tuple[str, int, int]] = []
     watch = lambda *stage: stages.append(stage)  # noqa: E731
-    result = calibrate(trainee, lessons_in(folder), 0, watch, EPOCHS)
+    result = calibrate(CalibrationRuns(trainee, lessons_in(folder), EPOCHS), watch)
     assert result.held_out == 0
     assert stages[3:] == [("choose", done, 2) for done in (0, 1, 2)]
     assert all(0.9 < value <= 1 for value in result.cosines[5].values())
@@ -271,7 +274,9 @@ def test_auto_takes_the_calibrator_that_does_best(
         return 10 * seen.low, 10 * seen.high
 
     monkeypatch.setitem(CALIBRATORS, "minmax", tenfold)
-    result = calibrate(trainee, lessons_in(folder), 0, ignore, EPOCHS, activation_bits=8)
+    result = calibrate(
+        CalibrationRuns(trainee, lessons_in(folder), EPOCHS), ignore, activation_bits=8
+    )
     for layer, name in result.chosen.items():
         assert name != "minmax"
         assert result.cosines[layer]["minmax"] < result.cosines[layer][name]
@@ -281,11 +286,11 @@ def test_a_named_calibrator_gives_all_ranges_and_is_not_compared(
     folder: Path, trainee: Trainee
 ) -> None:
     frames = lessons_in(folder)
-    seen, _ = observe_lesson(trainee, frames, 0, EPOCHS, 0)
-    for layer, observers in observe_lesson(trainee, frames, 0, EPOCHS, 1)[0].items():
+    seen, _ = observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), 0)
+    for layer, observers in observe_lesson(CalibrationRuns(trainee, frames, EPOCHS), 1)[0].items():
         seen[layer].merge(observers)
     for name, bits in itertools.product(CALIBRATORS, ACTIVATION_BITS):
-        result = calibrate(trainee, frames, 0, ignore, EPOCHS, name, bits)
+        result = calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, name, bits)
         assert result.chosen == {4: name, 5: name}
         assert result.cosines == {4: {}, 5: {}}
         for layer, ranges in result.ranges.items():
@@ -293,7 +298,7 @@ def test_a_named_calibrator_gives_all_ranges_and_is_not_compared(
     narrow, wide = (seen[4].ranges("mse", 2**bits, LABELS) for bits in ACTIVATION_BITS)
     assert (narrow.hidden_high[0] < wide.hidden_high[0]).any()  # bits are not all the same to it
     with pytest.raises(QsgmError, match=r"no calibrator 'median'; take one of auto, minmax, .*mse"):
-        calibrate(trainee, frames, 0, ignore, EPOCHS, "median")
+        calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, "median")
 
 
 @pytest.mark.parametrize(("held_out", "why"), [(6, "held-out frames, 6"), (0, "too few to hold")])
@@ -326,7 +331,7 @@ def test_memory_of_calibration_does_not_grow_with_its_frames(
     for count in (2, 2, 6):  # the first run fills caches
         frames.frames._entries = entries[:count]
         tracemalloc.start()
-        calibrate(trainee, frames, 0, ignore, EPOCHS, activation_bits=8)
+        calibrate(CalibrationRuns(trainee, frames, EPOCHS), ignore, activation_bits=8)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     # Kept, what SGMs see in a frame's three passes over 33 crops would be 13 KB, the frame 900 KB.
@@ -368,9 +373,9 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
     rates = {str(single_layers(GRASPNET.last(tuned))): (1e-4,) * tuned for tuned in range(1, 6)}
     of_five = prepare(Checkpoint(task_record(TASK), ConvNet(GRASPNET).eval(), sgms, {}, rates, {}))
     frames = lessons_in(folder)
-    done = calibrate(of_five, frames, 0, ignore, EPOCHS, "minmax")
+    done = calibrate(CalibrationRuns(of_five, frames, EPOCHS), ignore, "minmax")
     ranges = done.ranges
-    whole = calibrate(of_three(of_five), frames, 0, ignore, EPOCHS, "minmax").ranges
+    whole = calibrate(CalibrationRuns(of_three(of_five), frames, EPOCHS), ignore, "minmax").ranges
     for layer in (4, 5):  # as if there were no others
         np.testing.assert_array_equal(ranges[layer].input_high, whole[layer].input_high)
     seen: dict[int, list[FloatArray]] = {layer: [] for layer in of_five.sgms}
@@ -388,11 +393,11 @@ def test_sgms_that_see_maps_are_calibrated_and_measured_as_well(folder: Path) ->
         high = inputs.max(axis=(0, 1))[:-3]
         np.testing.assert_array_equal(ranges[layer].input_high[:-3], high)
     int8 = {layer: quantize_sgm(sgm, ranges[layer]) for layer, sgm in of_five.sgms.items()}
-    fidelity = measure(of_five, int8, frames, 0, ignore, EPOCHS)
+    fidelity = measure(CalibrationRuns(of_five, frames, EPOCHS), int8, ignore)
     assert set(fidelity) == {2, 3, 4, 5}
     # The runs with maps, taken once and looked at again, say the same.
     assert sorted(done.looks) == [0, 1]
-    assert measure(of_five, int8, frames, 0, ignore, EPOCHS, looks=done.looks) == fidelity
+    assert measure(CalibrationRuns(of_five, frames, EPOCHS, done.looks), int8, ignore) == fidelity
     for layer in (2, 3):
         assert fidelity[layer].cos_int8_float > 0.999
         assert fidelity[layer].clipped_fraction < 1e-3

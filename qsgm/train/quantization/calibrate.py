@@ -9,8 +9,8 @@ frames, with ranges from the others, and takes for each layer the one whose int8
 most nearly where the float ones do.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -23,18 +23,15 @@ from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, SgmRanges, integer_forwa
 from qsgm.sgm.ranges import CALIBRATORS, SgmObservers
 from qsgm.train.processes import InTurn
 from qsgm.train.quantization.calibration_runs import (
-    EPOCHS,
+    CalibrationRuns,
     Look,
     Looks,
     RunPlan,
     Trainee,
     float_moment,
-    measured_moments,
-    measured_plans,
-    run,
+    in_each,
     run_plans,
 )
-from qsgm.train.quantization.lessons import Lessons
 
 # Not a calibrator: for each layer the best of them.
 AUTO = "auto"
@@ -60,11 +57,8 @@ class Calibration:
 
 
 def calibrate(
-    trainee: Trainee,
-    lessons: Lessons,
-    seed: int,
+    runs: CalibrationRuns,
     watch: Progress,
-    epochs: int = EPOCHS,
     calibrator: str = AUTO,
     activation_bits: ActivationBits = 16,
     in_turn: InTurn = map,
@@ -76,11 +70,8 @@ def calibrate(
     :data:`qsgm.train.quantization.calibration_runs.MAP_EPOCHS`.
 
     Args:
-        trainee: what to fine-tune.
-        lessons: the calibration set.
-        seed: of crops and batches.
+        runs: of what is fine-tuned, on the calibration set.
         watch: told about progress.
-        epochs: length of a whole run.
         calibrator: one of :data:`qsgm.sgm.ranges.CALIBRATORS`, or :data:`AUTO`: for each layer
             the one that does best on frames held out.
         activation_bits: of the int8 SGMs.
@@ -90,19 +81,19 @@ def calibrate(
         QsgmError: there is no such calibrator, a run diverged, or a frame cannot be used.
     """
     refuse_unknown(calibrator)
-    held_out = held_out_frames(len(lessons)) if calibrator == AUTO else range(0)
-    everything, compared, looks = observe(trainee, lessons, seed, watch, epochs, held_out, in_turn)
-    levels = 2**activation_bits
+    trainee, every = runs.trainee, range(len(runs.lessons))
+    held_out = held_out_frames(len(every)) if calibrator == AUTO else range(0)
+    everything, compared, looks = observe(runs, watch, held_out, in_turn)
     if calibrator == AUTO:
         candidates = quantize_all(trainee, compared, activation_bits)
-        judges = held_out or range(len(lessons))
-        cosines = judge(trainee, candidates, lessons, judges, seed, watch, epochs, looks, in_turn)
+        judges = held_out or every
+        cosines = judge(replace(runs, looks=looks), candidates, judges, watch, in_turn)
         chosen = {layer: best_calibrator(cosines[layer]) for layer in trainee.sgms}
     else:
         cosines = {layer: {} for layer in trainee.sgms}
         chosen = dict.fromkeys(trainee.sgms, calibrator)
     ranges = {
-        layer: everything[layer].ranges(chosen[layer], levels, trainee.label_span)
+        layer: everything[layer].ranges(chosen[layer], 2**activation_bits, trainee.label_span)
         for layer in trainee.sgms
     }
     return Calibration(ranges, chosen, cosines, len(held_out), looks)
@@ -122,38 +113,30 @@ def held_out_frames(count: int) -> range:
 
 
 def observe(
-    trainee: Trainee,
-    lessons: Lessons,
-    seed: int,
-    watch: Progress,
-    epochs: int,
-    held_out: range,
-    in_turn: InTurn,
+    runs: CalibrationRuns, watch: Progress, held_out: range, in_turn: InTurn
 ) -> tuple[dict[int, SgmObservers], dict[int, SgmObservers], Looks]:
     """What each SGM sees in the runs on all frames, and on those that are not held out; looks."""
     everything, compared = (
-        {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()} for _ in range(2)
+        {layer: SgmObservers(sgm) for layer, sgm in runs.trainee.sgms.items()} for _ in range(2)
     )
-    watch("calibrate", 0, len(lessons))
-    work, looks = partial(observe_lesson, trainee, lessons, seed, epochs), Looks()
-    for i, (observers, kept) in enumerate(in_turn(work, range(len(lessons)))):
+    work, looks = partial(observe_lesson, runs), Looks()
+    for i, (observers, kept) in in_each(
+        range(len(runs.lessons)), work, "calibrate", watch, in_turn
+    ):
         for layer, seen in observers.items():
             everything[layer].merge(seen)
             if i not in held_out:
                 compared[layer].merge(seen)
         if kept:
             looks[i] = kept
-        watch("calibrate", i + 1, len(lessons))
     return everything, compared, looks
 
 
-def observe_lesson(
-    trainee: Trainee, lessons: Lessons, seed: int, epochs: int, i: int
-) -> tuple[dict[int, SgmObservers], list[Look]]:
+def observe_lesson(runs: CalibrationRuns, i: int) -> tuple[dict[int, SgmObservers], list[Look]]:
     """What each SGM sees in the runs on one lesson, and looks at the run with maps."""
-    kept = list[Look]()
+    kept, trainee = list[Look](), runs.trainee
     observers = {layer: SgmObservers(sgm) for layer, sgm in trainee.sgms.items()}
-    for plan in run_plans(trainee.network, trainee.checkpoint.most_layers, epochs):
+    for plan in run_plans(trainee.network, trainee.checkpoint.most_layers, runs.epochs):
 
         def gradient(layer: int, seen: FloatArray, plan: RunPlan = plan) -> FloatArray:
             result, hidden = trainee.float_trace(layer, seen)
@@ -161,8 +144,7 @@ def observe_lesson(
                 observers[layer].update(seen, hidden)
             return result
 
-        lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
-        for done, moment in enumerate(run(trainee, lesson, plan, [seed, i], gradient)):
+        for done, moment in enumerate(runs.run(i, plan, gradient)):
             if plan.maps and done % plan.measure_every == 0:
                 kept.append(Look.at(moment))
     return observers, kept
@@ -185,29 +167,16 @@ def quantize_all(
 
 
 def judge(
-    trainee: Trainee,
-    candidates: Candidates,
-    lessons: Lessons,
-    judges: range,
-    seed: int,
-    watch: Progress,
-    epochs: int,
-    looks: Looks,
-    in_turn: InTurn,
+    runs: CalibrationRuns, candidates: Candidates, judges: range, watch: Progress, in_turn: InTurn
 ) -> dict[int, dict[str, float]]:
-    """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer.
-
-    The float SGMs drive the runs, so that all calibrators are asked the same.
-    """
+    """Each calibrator's mean cosine of int8 to float gradients on some frames, by layer."""
     cosines: dict[int, dict[str, list[float]]] = {
         layer: {name: [] for name in CALIBRATORS} for layer in candidates
     }
-    watch("choose", 0, len(judges))
-    work = partial(judge_lesson, trainee, candidates, lessons, seed, epochs, looks)
-    for done, found in enumerate(in_turn(work, judges), start=1):
+    work = partial(judge_lesson, runs, candidates)
+    for _, found in in_each(judges, work, "choose", watch, in_turn):
         for layer, name, value in found:
             cosines[layer][name].append(value)
-        watch("choose", done, len(judges))
     return {
         layer: {name: float(np.mean(values)) for name, values in by_name.items()}
         for layer, by_name in cosines.items()
@@ -215,41 +184,23 @@ def judge(
 
 
 def judge_lesson(
-    trainee: Trainee,
-    candidates: Candidates,
-    lessons: Lessons,
-    seed: int,
-    epochs: int,
-    looks: Looks,
-    i: int,
+    runs: CalibrationRuns, candidates: Candidates, i: int
 ) -> list[tuple[int, str, float]]:
-    """Every calibrator's cosines in the runs on one lesson."""
+    """Every now and then along the runs on one lesson, each calibrator's cosine at each SGM.
+
+    The float SGMs drive the runs, so that all calibrators are asked the same.
+    """
+
+    def gradient(_: RunPlan, layer: int, seen: FloatArray) -> FloatArray:
+        return runs.trainee.float_trace(layer, seen)[0]
+
     return [
-        found
-        for plan in measured_plans(trainee, epochs)
-        for found in judge_run(trainee, candidates, lessons, i, plan, seed, looks)
+        (layer, name, cosine(integer_forward(sgm, seen)[0], floating))
+        for plan, moment in runs.measured(i, gradient)
+        for layer, (seen, floating) in float_moment(runs.trainee, moment).items()
+        if layer in plan.measured
+        for name, sgm in candidates[layer].items()
     ]
-
-
-def judge_run(
-    trainee: Trainee,
-    candidates: Candidates,
-    lessons: Lessons,
-    i: int,
-    plan: RunPlan,
-    seed: int,
-    looks: Looks,
-) -> Iterator[tuple[int, str, float]]:
-    """Every now and then along one run, each calibrator's cosine at each SGM it is there for."""
-
-    def driver(layer: int, seen: FloatArray) -> FloatArray:
-        return trainee.float_trace(layer, seen)[0]
-
-    for moment in measured_moments(trainee, lessons, i, plan, seed, driver, looks):
-        for layer, (seen, floating) in float_moment(trainee, moment).items():
-            if layer in plan.measured:
-                for name, sgm in candidates[layer].items():
-                    yield layer, name, cosine(integer_forward(sgm, seen)[0], floating)
 
 
 def best_calibrator(cosines: Mapping[str, float]) -> str:

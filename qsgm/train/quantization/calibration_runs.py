@@ -5,8 +5,10 @@ run only its current step is in memory.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor
 from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.network import ONE, Network, Pair
+from qsgm.progress import Progress
 from qsgm.schedule import BATCH, MOMENTUM, rate_factor
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_product, float_trace
 from qsgm.task import Lesson, label_span
@@ -25,6 +28,7 @@ from qsgm.train.model.fold import fold_net, fold_sgm, run_folded_conv
 from qsgm.train.model.local import LayerState, columns, layer_forward, local_step
 from qsgm.train.model.net import maps_of, positions_of
 from qsgm.train.pretraining.tasks import SeenLesson, see_lesson, start_states
+from qsgm.train.processes import InTurn
 from qsgm.train.quantization.lessons import Lessons
 from qsgm.weights import to_step_layout
 
@@ -39,6 +43,7 @@ MAP_EPOCHS = 10
 MEASURE_EVERY_STEPS = 13
 MEASURE_MAPS_EVERY_STEPS = 15
 
+Done = TypeVar("Done")
 # (layer, what its SGM sees (B, P, Ci)) -> gradient (B, P, C)
 SgmGradient = Callable[[int, FloatArray], FloatArray]
 
@@ -202,23 +207,45 @@ def run(
             done += 1
 
 
-def measured_moments(
-    trainee: Trainee,
-    lessons: Lessons,
-    i: int,
-    plan: RunPlan,
-    seed: int,
-    sgm_gradient: SgmGradient,
-    looks: Looks,
-) -> Iterator[Moment]:
-    """Every now and then a step of the run on a lesson; of looks that were kept, those."""
-    lesson = lessons.lesson(i, np.random.default_rng([seed, i]), plan.crops)
-    if plan.maps and i in looks:
-        task = trainee.seen(lesson, plan.tuned)
-        yield from (look.again(task) for look in looks[i])
-    else:
-        steps = run(trainee, lesson, plan, [seed, i], sgm_gradient)
-        yield from islice(steps, 0, None, plan.measure_every)
+@dataclass(frozen=True)
+class CalibrationRuns:
+    """The same runs on every lesson of a calibration set, whoever goes along."""
+
+    trainee: Trainee
+    lessons: Lessons
+    epochs: int = EPOCHS  # length of a whole run
+    looks: Looks = field(default_factory=dict)  # that were kept, and are taken again
+    seed: int = 0  # of crops and batches
+
+    def lesson(self, i: int, plan: RunPlan) -> Lesson:
+        """What a run on the i-th lesson learns from."""
+        return self.lessons.lesson(i, np.random.default_rng([self.seed, i]), plan.crops)
+
+    def run(self, i: int, plan: RunPlan, sgm_gradient: SgmGradient) -> Iterator[Moment]:
+        """Every step of a run on the i-th lesson, see :func:`run`."""
+        return run(self.trainee, self.lesson(i, plan), plan, [self.seed, i], sgm_gradient)
+
+    def measured(
+        self, i: int, gradient: Callable[[RunPlan, int, FloatArray], FloatArray]
+    ) -> Iterator[tuple[RunPlan, Moment]]:
+        """Every now and then a step of the runs that show all SGMs, as `gradient` drives them."""
+        for plan in measured_plans(self.trainee, self.epochs):
+            if plan.maps and i in self.looks:
+                task = self.trainee.seen(self.lesson(i, plan), plan.tuned)
+                yield from ((plan, look.again(task)) for look in self.looks[i])
+            else:
+                steps = self.run(i, plan, partial(gradient, plan))
+                yield from ((plan, one) for one in islice(steps, 0, None, plan.measure_every))
+
+
+def in_each(
+    lessons: range, work: Callable[[int], Done], stage: str, watch: Progress, in_turn: InTurn
+) -> Iterator[tuple[int, Done]]:
+    """What comes of every lesson, by its number; `watch` is told about each."""
+    watch(stage, 0, len(lessons))
+    for done, found in enumerate(in_turn(work, lessons)):  # not zip, which keeps the one before
+        yield lessons[done], found
+        watch(stage, done + 1, len(lessons))
 
 
 def step(

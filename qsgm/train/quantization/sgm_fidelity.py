@@ -1,6 +1,6 @@
 """How faithful int8 SGMs are along whole fine-tuning runs on the calibration set."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 
 import torch
@@ -14,29 +14,20 @@ from qsgm.sgm.int8 import QuantizedSgm, integer_forward, underflow_fraction
 from qsgm.train.model.local import through_activation, true_gradients, weight_gradients
 from qsgm.train.processes import InTurn
 from qsgm.train.quantization.calibration_runs import (
-    EPOCHS,
-    Looks,
+    CalibrationRuns,
     Moment,
     RunPlan,
     Trainee,
     float_moment,
-    measured_moments,
-    measured_plans,
+    in_each,
     passes_of,
 )
-from qsgm.train.quantization.lessons import Lessons
-
-NO_LOOKS: Looks = {}
 
 
 def measure(
-    trainee: Trainee,
+    runs: CalibrationRuns,
     int8_sgms: Mapping[int, QuantizedSgm],
-    lessons: Lessons,
-    seed: int,
     watch: Progress,
-    epochs: int = EPOCHS,
-    looks: Looks = NO_LOOKS,
     in_turn: InTurn = map,
 ) -> dict[int, LayerFidelity]:
     """Fidelity of each int8 SGM, mean over runs on every frame.
@@ -44,53 +35,31 @@ def measure(
     Behind layers 4 and 5 it is taken along whole runs of the last three layers, and the int8 SGMs
     drive them, as on the device: what they see is what they have led to. Behind layers 1 to 3 it is
     taken along the short runs of all layers, which the float SGMs drive: they are quicker here, and
-    calibration's `looks` at them can be looked at again.
+    looks that calibration kept of them can be taken again.
     """
     measured: dict[int, list[LayerFidelity]] = {layer: [] for layer in int8_sgms}
-    watch("measure", 0, len(lessons))
-    work = partial(measure_lesson, trainee, int8_sgms, lessons, seed, epochs, looks)
-    for done, found in enumerate(in_turn(work, range(len(lessons))), start=1):
+    work, lessons = partial(measure_lesson, runs, int8_sgms), range(len(runs.lessons))
+    for _, found in in_each(lessons, work, "measure", watch, in_turn):
         for layer, fidelity in found:
             measured[layer].append(fidelity)
-        watch("measure", done, len(lessons))
     return {layer: mean_over_run(values) for layer, values in measured.items()}
 
 
 def measure_lesson(
-    trainee: Trainee,
-    int8_sgms: Mapping[int, QuantizedSgm],
-    lessons: Lessons,
-    seed: int,
-    epochs: int,
-    looks: Looks,
-    i: int,
+    runs: CalibrationRuns, int8_sgms: Mapping[int, QuantizedSgm], i: int
 ) -> list[tuple[int, LayerFidelity]]:
-    """What each SGM is worth in the runs on one lesson."""
-    return [
-        found
-        for plan in measured_plans(trainee, epochs)
-        for found in measure_run(trainee, int8_sgms, lessons, i, plan, seed, looks)
-    ]
+    """Every now and then along the runs on one lesson, what each SGM is worth."""
 
-
-def measure_run(
-    trainee: Trainee,
-    int8_sgms: Mapping[int, QuantizedSgm],
-    lessons: Lessons,
-    i: int,
-    plan: RunPlan,
-    seed: int,
-    looks: Looks,
-) -> Iterator[tuple[int, LayerFidelity]]:
-    """Every now and then along one run, what the SGMs that it is there for are worth."""
-
-    def driver(layer: int, seen: FloatArray) -> FloatArray:
+    def gradient(plan: RunPlan, layer: int, seen: FloatArray) -> FloatArray:
         if plan.maps:
-            return trainee.float_trace(layer, seen)[0]
+            return runs.trainee.float_trace(layer, seen)[0]
         return integer_forward(int8_sgms[layer], seen)[0]
 
-    for moment in measured_moments(trainee, lessons, i, plan, seed, driver, looks):
-        yield from compare_moment(trainee, int8_sgms, moment, plan.measured).items()
+    return [
+        found
+        for plan, moment in runs.measured(i, gradient)
+        for found in compare_moment(runs.trainee, int8_sgms, moment, plan.measured).items()
+    ]
 
 
 def compare_moment(
