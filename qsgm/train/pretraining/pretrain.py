@@ -16,7 +16,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from errno import EACCES
@@ -162,14 +162,14 @@ def pretrain(
     _check_output(output)
     extra = {} if last_stage is None else last_stage.to_json()
     identity = _identity(task, seed, device, config, extra)
-    if trained is None:
-        partial = Partial.open(output, identity)
-        net = _backbone(partial, config, task, seed, device, watch)
-    else:
-        partial = Partial.open(output, identity | {"trained": _digest(trained)})
-        net = _portable(deepcopy(trained))  # meta-training gives it a new start
+    if trained is not None:
+        identity |= {"trained": _digest(trained)}
+    partial = Partial.open(output, identity)
+    stages = _Stages(task, config, seed, watch, partial)
+    # Meta-training gives a network a new start.
+    net = stages.backbone(device) if trained is None else _portable(deepcopy(trained))
     with one_thread():
-        learnt = _learn(partial, net, task, config, seed, watch)
+        learnt = stages.learnt(net)
         done = task if last_stage is None else last_stage(learnt, seed, watch)
     command = _command(seed, device, config) + arguments
     config = replace(config, first_rates=learnt.first_rates)
@@ -189,28 +189,6 @@ def pretrain(
     write_text_atomic(output.with_suffix(".md"), _card_text(output, card))
     partial.remove()
     return checkpoint
-
-
-def _learn(
-    partial: Partial,
-    net: ConvNet,
-    task: DrawnTask,
-    config: PretrainConfig,
-    seed: int,
-    watch: Progress,
-) -> Learnt:
-    """Stages 2 to 5; `net` gets its new start."""
-    late = config.late
-    tasks = _draw(net, task, config.tasks, config.crops_per_task, seed + 1, watch, late)
-    sgms = _match(partial, net, tasks, config, task, seed, watch)
-    first = _first_rates(net, sgms, tasks, config, task, watch)
-    _match_on(partial, net, sgms, tasks, first, config, task, seed, watch)
-    rule = _meta_train(partial, net, sgms, tasks, first, config, task, seed, watch)
-    early = _match_early(partial, net, rule, task, config, seed, watch)
-    rule = replace(rule, sgms={**early, **rule.sgms})
-    rates, found = _choose_rates(net, rule, task, config, seed, watch)
-    rule = replace(rule, rates=found.rates[late])
-    return Learnt(net, first, rule, rates, found)
 
 
 def _identity(
@@ -234,78 +212,190 @@ def _digest(net: ConvNet) -> str:
     return digest.hexdigest()
 
 
-def _backbone(
-    partial: Partial,
-    config: PretrainConfig,
-    task: DrawnTask,
-    seed: int,
-    device: str,
-    watch: Progress,
-) -> ConvNet:
-    training = BackboneTraining(config.backbone, task, seed, device)
-    if "net" in partial.data:
-        training.net.load_state_dict(partial.data["net"])
-        return _portable(training.net)
-    if "backbone" in partial.data:
-        training.resume(partial.data["backbone"])
-    mean = 0.0
+@dataclass(frozen=True)
+class _Stages:
+    """The stages of one pretraining, and what is done so far."""
 
-    def after_step(step: int, value: float) -> None:
-        nonlocal mean
-        mean = value if mean == 0.0 else 0.98 * mean + 0.02 * value
-        watch("backbone", step, config.backbone.steps, {"loss": mean})
-        if step % SAVE_EVERY == 0:
-            _refuse_unless_finite("backbone", training.net)
-            partial.save(backbone=training.state())
+    task: DrawnTask
+    config: PretrainConfig
+    seed: int
+    watch: Progress
+    partial: Partial
 
-    net = _portable(training.run(after_step))
-    _refuse_unless_finite("backbone", net)
-    partial.save(backbone=None, net=net.state_dict())
-    return net
+    def backbone(self, device: str) -> ConvNet:
+        """Stage 1."""
+        partial, config = self.partial, self.config.backbone
+        training = BackboneTraining(config, self.task, self.seed, device)
+        if "net" in partial.data:
+            training.net.load_state_dict(partial.data["net"])
+            return _portable(training.net)
+        if "backbone" in partial.data:
+            training.resume(partial.data["backbone"])
+        mean = 0.0
+
+        def after_step(step: int, value: float) -> None:
+            nonlocal mean
+            mean = value if mean == 0.0 else 0.98 * mean + 0.02 * value
+            self.watch("backbone", step, config.steps, {"loss": mean})
+            if step % SAVE_EVERY == 0:
+                _refuse_unless_finite("backbone", training.net)
+                partial.save(backbone=training.state())
+
+        net = _portable(training.run(after_step))
+        _refuse_unless_finite("backbone", net)
+        partial.save(backbone=None, net=net.state_dict())
+        return net
+
+    def learnt(self, net: ConvNet) -> Learnt:
+        """Stages 2 to 5; `net` gets its new start."""
+        config, late = self.config, self.config.late
+        tasks = self._drawn(net, config.tasks, config.crops_per_task, 1, late)
+        sgms = self._matched(net, tasks)
+        first = self._first_rates(net, sgms, tasks)
+        self._match_on(net, sgms, tasks, first)
+        rule = self._meta_trained(net, sgms, tasks, first)
+        rule = replace(rule, sgms={**self._early(net, rule), **rule.sgms})
+        rates, found = self._rates(net, rule)
+        return Learnt(net, first, replace(rule, rates=found.rates[late]), rates, found)
+
+    def _drawn(self, net: ConvNet, count: int, samples: int, shift: int, tuned: int) -> TaskSet:
+        """Tasks as the first of so many tuned layers sees them."""
+        after_task, last_frozen = counted(self.watch, "tasks", count), net.network.depth - tuned
+        return draw_tasks(
+            net, self.task, count, samples, self.seed + shift, after_task, last_frozen
+        )
+
+    def _resumed(self, part: str, sgms: Mapping[int, Sgm]) -> bool:
+        """Whether SGMs were learnt before an interruption; they are then as they were."""
+        saved = self.partial.data.get(part)
+        if saved is not None:
+            for layer, sgm in sgms.items():
+                sgm.load_state_dict(saved[layer])
+                sgm.eval()
+        return saved is not None
+
+    def _matched(self, net: ConvNet, tasks: TaskSet) -> dict[int, Sgm]:
+        """Stage 2: SGMs that regress true gradients."""
+        config, network, sizes = self.config, self.task.network, self.config.matching
+        torch.manual_seed(self.seed + 3)
+        layers = network.last(config.late)
+        sgms = {layer: Sgm(network, layer, config.hidden) for layer in layers[:-1]}
+        if self._resumed("sgms", sgms):
+            return sgms
+        start = folded_start(net, len(layers))
+        if isinstance(config.first_rates, int):
+            rate = rate_alone(tasks, start, self.task, sizes, self.seed) if sgms else 0.0
+        else:
+            rate = config.first_rates[0]
+        # All but the first hold still here: what its SGM regresses is then a function of its input.
+        rates = (rate, *[0.0] * len(sgms))
+        examples = record_examples(tasks, start, rates, self.task, sizes, self.seed)
+        after_step = counted(self.watch, "matching", len(sgms) * sizes.fit_steps)
+        for layer, sgm in sgms.items():
+            fit_sgm(sgm, examples[layer], sizes, self.seed + layer, after_step)
+        _refuse_unless_finite("matching", *sgms.values())
+        self.partial.save(sgms=_copied(sgms))
+        return sgms
+
+    def _first_rates(self, net: ConvNet, sgms: dict[int, Sgm], tasks: TaskSet) -> tuple[float, ...]:
+        """Where meta-training starts."""
+        config = self.config
+        if isinstance(config.first_rates, tuple):
+            return config.first_rates
+        after_run = _scored(counted(self.watch, "first rates", len([*candidates(config.late)])))
+        rule = UpdateRule(sgms, FLAT, (), self.task)
+        return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
+
+    def _match_on(
+        self, net: ConvNet, sgms: dict[int, Sgm], tasks: TaskSet, rates: tuple[float, ...]
+    ) -> None:
+        """Teach the SGMs, in place, along runs that they drive."""
+        sizes = self.config.own_runs
+        if not sizes.rounds or self._resumed("own", sgms):
+            return
+        after_step = counted(self.watch, "own runs", len(sgms) * sizes.rounds * sizes.fit.fit_steps)
+        start = folded_start(net, self.config.late)
+        learn_along_own_runs(sgms, start, tasks, rates, self.task, sizes, self.seed + 7, after_step)
+        _refuse_unless_finite("own runs", *sgms.values())
+        self.partial.save(own=_copied(sgms))
+
+    def _meta_trained(
+        self, net: ConvNet, sgms: dict[int, Sgm], tasks: TaskSet, rates: tuple[float, ...]
+    ) -> UpdateRule:
+        """Stage 3; SGMs and `net` are changed in place."""
+        config, partial = self.config.maml, self.partial
+        start = folded_start(net, len(rates))
+        training = MetaTraining(config, self.task, tasks, start, sgms, rates, self.seed)
+        if "meta" in partial.data:
+            training.resume(partial.data["meta"])
+        mean: dict[str, float] = {}
+
+        def after_step(step: int, figures: OuterFigures) -> None:
+            now = {"query": figures.query_loss}
+            now |= {f"cos{layer}": value for layer, value in figures.cosine.items()}
+            for name, value in now.items():
+                if value == value:
+                    mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
+            self.watch("meta", step, config.outer_steps, dict(mean))
+            if step % SAVE_EVERY == 0:
+                _refuse_unless_finite("meta", *sgms.values())
+                partial.save(meta=training.state())
+
+        training.run(after_step)
+        write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
+        _refuse_unless_finite("meta", net, *sgms.values())
+        learnt = tuple(float(rate) for rate in training.log_rates.detach().exp())
+        return UpdateRule(sgms, training.learnt_curvatures(), learnt, self.task)
+
+    def _early(self, net: ConvNet, rule: UpdateRule) -> dict[int, Sgm]:
+        """Stage 4: the SGMs in front of the meta-trained layers."""
+        early, depth = self.config.early, self.task.network.depth
+        if len(rule.rates) == depth:
+            return {}
+        pixels = self._drawn(net, early.tasks, early.crops_per_task, 4, depth)
+        training = MapMatching(early, rule, folded_start(net, depth), pixels, self.seed + 5)
+        if self._resumed("early", training.sgms):
+            return training.sgms
+        tell = counted(self.watch, "early", early.steps)
+
+        def after_step(cosines: dict[int, float]) -> None:
+            tell({f"cos{layer}": cosine for layer, cosine in cosines.items()})
+
+        sgms = training.run(after_step)
+        _refuse_unless_finite("early", *sgms.values())
+        self.partial.save(early={layer: sgm.state_dict() for layer, sgm in sgms.items()})
+        return sgms
+
+    def _rates(
+        self, net: ConvNet, rule: UpdateRule
+    ) -> tuple[dict[str, tuple[float, ...]], LateRates]:
+        """Rates of SGD for all numbers of layers and blocks, and how the late layers are tuned."""
+        sizes, network, late = self.config.rates, self.task.network, len(rule.rates)
+        tasks = self._drawn(net, sizes.tasks, sizes.crops_per_task, 2, late)
+        groups = _groups(rule, late) if self.config.grouped else []
+        total = (
+            late_runs(rule.rates)
+            if self.config.by_length
+            else len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
+        )
+        total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
+        after_run = _scored(counted(self.watch, "rates", total))
+        found = _late_rates(rule, folded_start(net, late), tasks, self.config, after_run)
+        rates, rule = dict(found.rates), replace(rule, rates=found.rates[late])
+        grouped = {} if self.config.grouped else block_rates(network, rates[late])
+        if late < network.depth:
+            count, samples = sizes.early_tasks, sizes.early_crops_per_task
+            pixels = self._drawn(net, count, samples, 6, network.depth)
+            whole = folded_start(net, network.depth)
+            rates |= choose_early(rule, whole, pixels, sizes, after_run)
+            grouped |= choose_grouped(rule, whole, pixels, sizes, groups, after_run)
+        singles = {str(single_layers(network.last(k))): one for k, one in rates.items()}
+        return singles | grouped, found
 
 
 def _portable(net: ConvNet) -> ConvNet:
     """On the CPU, in the usual layout, in eval mode."""
     return in_memory_format(net.cpu(), torch.contiguous_format).eval()
-
-
-def _draw(
-    net: ConvNet, task: DrawnTask, count: int, samples: int, seed: int, watch: Progress, tuned: int
-) -> TaskSet:
-    after_task = counted(watch, "tasks", count)
-    return draw_tasks(net, task, count, samples, seed, after_task, task.network.depth - tuned)
-
-
-def _match(
-    partial: Partial,
-    net: ConvNet,
-    tasks: TaskSet,
-    config: PretrainConfig,
-    task: DrawnTask,
-    seed: int,
-    watch: Progress,
-) -> dict[int, Sgm]:
-    torch.manual_seed(seed + 3)
-    layers = task.network.last(config.late)
-    sgms = {layer: Sgm(task.network, layer, config.hidden) for layer in layers[:-1]}
-    if "sgms" in partial.data:
-        for layer, sgm in sgms.items():
-            sgm.load_state_dict(partial.data["sgms"][layer])
-        return {layer: sgm.eval() for layer, sgm in sgms.items()}
-    start = folded_start(net, len(layers))
-    if isinstance(config.first_rates, int):
-        rate = rate_alone(tasks, start, task, config.matching, seed) if sgms else 0.0
-    else:
-        rate = config.first_rates[0]
-    # All but the first hold still here: what its SGM regresses is then a function of its input.
-    rates = (rate, *[0.0] * len(sgms))
-    examples = record_examples(tasks, start, rates, task, config.matching, seed)
-    after_step = counted(watch, "matching", len(sgms) * config.matching.fit_steps)
-    for layer, sgm in sgms.items():
-        fit_sgm(sgm, examples[layer], config.matching, seed + layer, after_step)
-    _refuse_unless_finite("matching", *sgms.values())
-    partial.save(sgms=_copied(sgms))
-    return sgms
 
 
 def _copied(sgms: dict[int, Sgm]) -> dict[int, dict[str, Tensor]]:
@@ -319,145 +409,6 @@ def _copied(sgms: dict[int, Sgm]) -> dict[int, dict[str, Tensor]]:
 def _scored(tell: Callable[..., None]) -> AfterRun:
     """Tells what comes of every run."""
     return lambda score: tell({"objective": score.objective})
-
-
-def _first_rates(
-    net: ConvNet,
-    sgms: dict[int, Sgm],
-    tasks: TaskSet,
-    config: PretrainConfig,
-    task: DrawnTask,
-    watch: Progress,
-) -> tuple[float, ...]:
-    """Where meta-training starts."""
-    if isinstance(config.first_rates, tuple):
-        return config.first_rates
-    after_run = _scored(counted(watch, "first rates", len([*candidates(config.late)])))
-    rule = UpdateRule(sgms, FLAT, (), task)
-    return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
-
-
-def _match_on(
-    partial: Partial,
-    net: ConvNet,
-    sgms: dict[int, Sgm],
-    tasks: TaskSet,
-    first_rates: tuple[float, ...],
-    config: PretrainConfig,
-    task: DrawnTask,
-    seed: int,
-    watch: Progress,
-) -> None:
-    """Teach the SGMs, in place, along runs that they drive."""
-    sizes = config.own_runs
-    if not sizes.rounds:
-        return
-    if "own" in partial.data:
-        for layer, sgm in sgms.items():
-            sgm.load_state_dict(partial.data["own"][layer])
-        return
-    after_step = counted(watch, "own runs", len(sgms) * sizes.rounds * sizes.fit.fit_steps)
-    start = folded_start(net, config.late)
-    learn_along_own_runs(sgms, start, tasks, first_rates, task, sizes, seed + 7, after_step)
-    _refuse_unless_finite("own runs", *sgms.values())
-    partial.save(own=_copied(sgms))
-
-
-def _meta_train(
-    partial: Partial,
-    net: ConvNet,
-    sgms: dict[int, Sgm],
-    tasks: TaskSet,
-    first_rates: tuple[float, ...],
-    config: PretrainConfig,
-    task: DrawnTask,
-    seed: int,
-    watch: Progress,
-) -> UpdateRule:
-    start = folded_start(net, len(first_rates))
-    training = MetaTraining(config.maml, task, tasks, start, sgms, first_rates, seed)
-    if "meta" in partial.data:
-        training.resume(partial.data["meta"])
-    mean: dict[str, float] = {}
-
-    def after_step(step: int, figures: OuterFigures) -> None:
-        now = {"query": figures.query_loss}
-        now |= {f"cos{layer}": value for layer, value in figures.cosine.items()}
-        for name, value in now.items():
-            if value == value:
-                mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
-        watch("meta", step, config.maml.outer_steps, dict(mean))
-        if step % SAVE_EVERY == 0:
-            _refuse_unless_finite("meta", *sgms.values())
-            partial.save(meta=training.state())
-
-    training.run(after_step)
-    write_back(net, [(weight.detach(), bias.detach()) for weight, bias in training.start])
-    _refuse_unless_finite("meta", net, *sgms.values())
-    rates = tuple(float(rate) for rate in training.log_rates.detach().exp())
-    return UpdateRule(sgms, training.learnt_curvatures(), rates, task)
-
-
-def _match_early(
-    partial: Partial,
-    net: ConvNet,
-    rule: UpdateRule,
-    task: DrawnTask,
-    config: PretrainConfig,
-    seed: int,
-    watch: Progress,
-) -> dict[int, Sgm]:
-    early, depth = config.early, task.network.depth
-    if len(rule.rates) == depth:
-        return {}
-    pixels = _draw(net, task, early.tasks, early.crops_per_task, seed + 4, watch, depth)
-    training = MapMatching(early, rule, folded_start(net, depth), pixels, seed + 5)
-    if "early" in partial.data:
-        for layer, sgm in training.sgms.items():
-            sgm.load_state_dict(partial.data["early"][layer])
-        return {layer: sgm.eval() for layer, sgm in training.sgms.items()}
-    tell = counted(watch, "early", early.steps)
-
-    def after_step(cosines: dict[int, float]) -> None:
-        tell({f"cos{layer}": cosine for layer, cosine in cosines.items()})
-
-    sgms = training.run(after_step)
-    _refuse_unless_finite("early", *sgms.values())
-    partial.save(early={layer: sgm.state_dict() for layer, sgm in sgms.items()})
-    return sgms
-
-
-def _choose_rates(
-    net: ConvNet,
-    rule: UpdateRule,
-    task: DrawnTask,
-    config: PretrainConfig,
-    seed: int,
-    watch: Progress,
-) -> tuple[dict[str, tuple[float, ...]], LateRates]:
-    """Rates of SGD for all numbers of layers and blocks, and how the late layers are tuned."""
-    sizes, network, late = config.rates, task.network, len(rule.rates)
-    tasks = _draw(net, task, sizes.tasks, sizes.crops_per_task, seed + 2, watch, late)
-    groups = _groups(rule, late) if config.grouped else []
-    total = (
-        late_runs(rule.rates)
-        if config.by_length
-        else len([*late_candidates(rule.rates)]) + len(SHORT_GAINS)
-    )
-    total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
-    after_run = _scored(counted(watch, "rates", total))
-    found = _late_rates(rule, folded_start(net, late), tasks, config, after_run)
-    rates, rule = dict(found.rates), replace(rule, rates=found.rates[late])
-    if late < network.depth:
-        count, samples = sizes.early_tasks, sizes.early_crops_per_task
-        pixels = _draw(net, task, count, samples, seed + 6, watch, network.depth)
-        whole = folded_start(net, network.depth)
-        rates |= choose_early(rule, whole, pixels, sizes, after_run)
-        grouped = choose_grouped(rule, whole, pixels, sizes, groups, after_run)
-    else:
-        grouped = {}
-    singles = {str(single_layers(network.last(k))): of_layers for k, of_layers in rates.items()}
-    return singles | (grouped if config.grouped else block_rates(network, rates[late])), found
 
 
 def _late_rates(

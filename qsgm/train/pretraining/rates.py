@@ -121,18 +121,12 @@ def choose_grouped(
         every: groups of more layers than were meta-trained.
         after_run: told about every run.
     """
-    chosen = {}
-    for blocks in every:
-        skipped = len(start) - len(blocks.layers)
-        seen = behind(rule.task.network, start[:skipped], pixels)
-        scores = {}
-        for rate in EARLY_RATE_GRID:
-            rates = (rate,) * (len(blocks.layers) - len(rule.rates)) + rule.rates
-            trial = replace(rule, rates=rates, blocks=blocks)
-            scores[rates] = run_sgms(trial, start[skipped:], seen, config.early_epochs, chunk=1)
-            after_run(scores[rates])
-        chosen[str(blocks)] = best_rates(scores)
-    return chosen
+    return {
+        str(blocks): _with_early(
+            replace(rule, blocks=blocks), len(blocks.layers), start, pixels, config, after_run
+        )
+        for blocks in every
+    }
 
 
 def choose_early(
@@ -147,17 +141,27 @@ def choose_early(
         config: sizes.
         after_run: told about every run.
     """
-    rates, chosen = rule.rates, {}
-    while len(rates) < len(start):
-        skipped = len(start) - len(rates) - 1
-        seen = behind(rule.task.network, start[:skipped], pixels)
-        scores = {}
-        for rate in EARLY_RATE_GRID:
-            trial = (rate, *rates)
-            scores[trial] = run_sgms(
-                replace(rule, rates=trial), start[skipped:], seen, config.early_epochs, chunk=1
-            )
-            after_run(scores[trial])
-        rates = best_rates(scores)
-        chosen[len(rates)] = rates
+    chosen = {}
+    for tuned in range(len(rule.rates) + 1, len(start) + 1):
+        chosen[tuned] = _with_early(rule, tuned, start, pixels, config, after_run)
+        rule = replace(rule, rates=chosen[tuned])
     return chosen
+
+
+def _with_early(
+    rule: UpdateRule,
+    tuned: int,
+    start: Start,
+    pixels: TaskSet,
+    config: RatesConfig,
+    after_run: AfterRun,
+) -> Rates:
+    """The rule's rates, and in front of them the best one of a few, up to so many layers."""
+    skipped, scores = len(start) - tuned, dict[Rates, Score]()
+    seen = behind(rule.task.network, start[:skipped], pixels)
+    for rate in EARLY_RATE_GRID:
+        rates = (rate,) * (tuned - len(rule.rates)) + rule.rates
+        trial = replace(rule, rates=rates)
+        scores[rates] = run_sgms(trial, start[skipped:], seen, config.early_epochs, chunk=1)
+        after_run(scores[rates])
+    return best_rates(scores)
