@@ -2,12 +2,20 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from qsgm import defaults, paths
-from qsgm.cli.console import host_module, open_bundle, progress, show, write_report
+from qsgm.cli.console import (
+    check_picture,
+    draw,
+    host_module,
+    open_bundle,
+    progress,
+    show,
+    write_report,
+)
 from qsgm.cli.options import (
     BundleOption,
     EpochsOption,
@@ -23,19 +31,17 @@ from qsgm.cli.options import (
     SeedOption,
     ThreadsOption,
     TrunkOption,
+    parsed,
     parsed_layer_counts,
     parsed_run_lengths,
     parsed_thread_counts,
-    parsed_variant,
     settings_of,
     value_of,
 )
-from qsgm.errors import QsgmError
 from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
     from qsgm.bench.frames import BenchFrame
-    from qsgm.bench.rivals import Rival
 
 app = typer.Typer(help="Measure what the pages in docs/ state.")
 
@@ -143,15 +149,16 @@ def bench_scenes(
     scene with the object and without it. Rivals look at the same scenes; how they are called,
     `benchmarks/rivals` shows.
     """
+    from qsgm.bench.rivals import parse_rival
     from qsgm.bench.scenes_report import render
     from qsgm.bench.scenes_run import run_scenes
 
-    parsed = [parsed_rival(text) for text in rivals or []]
+    others = [parsed(parse_rival, text, "--rival") for text in rivals or []]
     settings = settings_of(int8, method, layers, optimizer, epochs, seed, threads)
     loaded, asked = open_bundle(bundle), conditions or [*SceneCondition]
     with progress() as watch:
         values = run_scenes(
-            frames, limit, asked, scenes, settings, loaded, parsed, keep, output, watch
+            frames, limit, asked, scenes, settings, loaded, others, keep, output, watch
         )
     show(values, render(values), as_json)
 
@@ -298,7 +305,7 @@ def bench_calibration(
     as_json: JsonOption = False,
 ) -> None:
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
-    from qsgm.bench.calibration import VARIANTS, measure_calibration, render
+    from qsgm.bench.calibration import VARIANTS, measure_calibration, parse_variant, render
     from qsgm.bench.frames import list_frames
     from qsgm.tune.settings import Settings
 
@@ -306,7 +313,7 @@ def bench_calibration(
     folder = paths.calibration_folder(calib)
     some = list_frames(frames, limit)
     settings = Settings(epochs=epochs, seed=seed, threads=threads)
-    chosen = [parsed_variant(text) for text in variants] if variants else VARIANTS
+    chosen = [parsed(parse_variant, one, "--variant") for one in variants or ()] or VARIANTS
     with progress() as watch:
         report = measure_calibration(some, folder, open_bundle(bundle), settings, watch, chosen)
     values = report.to_json()
@@ -339,32 +346,8 @@ def bench_paper(
     show(host.to_json(results), host.render(results), as_json)
 
 
-def check_picture(path: Path | None) -> None:
-    """Raise QsgmError where a picture is asked for that cannot be drawn, before hours of work."""
-    if path is not None:
-        host_module("matplotlib")
-
-
-def draw(chart: str, values: dict[str, Any], path: Path | None) -> None:
-    """Write one of the charts of :mod:`qsgm.bench.charts` as a PNG file, if it was asked for."""
-    from qsgm.bench import charts
-
-    if path is not None:
-        charts.write_chart(getattr(charts, chart)(values), path)
-
-
 def frames_of(folder: Path | None, limit: int | None) -> list["BenchFrame"]:
     """Demonstrations of a folder, or the calibration set's."""
     from qsgm.bench.frames import list_frames
 
     return list_frames(paths.calibration_folder() if folder is None else folder, limit)
-
-
-def parsed_rival(text: str) -> "Rival":
-    """A rival's name and command, such as `ncc=python benchmarks/rivals/ncc.py`."""
-    from qsgm.bench.rivals import parse_rival
-
-    try:
-        return parse_rival(text)
-    except QsgmError as error:
-        raise typer.BadParameter(str(error), param_hint="'--rival'") from error

@@ -10,6 +10,8 @@ import typer
 from qsgm import defaults, paths
 from qsgm.cli.console import (
     check_output,
+    check_picture,
+    draw,
     host_module,
     open_bundle,
     progress,
@@ -362,8 +364,7 @@ def fidelity(
     """Compare int8, float and true gradients along one fine-tuning; keeps nothing."""
     from qsgm.tune.report import fidelity_command_json, fidelity_command_report
 
-    if picture is not None:
-        host_module("matplotlib")
+    check_picture(picture)
     tuned = tuned_layers(layers, None)
     settings = settings_of(
         int8, MethodName.SGM, tuned, optimizer, epochs, seed, threads, trunk=trunk
@@ -388,10 +389,7 @@ def fidelity(
             "nothing to compare; export it again with `qsgm fold-and-quantize`"
         )
     report = fidelity_command_json(result, as_text(paths.name_of(frame)))
-    if picture is not None:
-        from qsgm.bench.charts import fidelity_over_run, write_chart
-
-        write_chart(fidelity_over_run(report), picture)
+    draw("fidelity_over_run", report, picture)
     write_report(report, output)
     show(report, fidelity_command_report(result), as_json)
     if picture is not None and not as_json:

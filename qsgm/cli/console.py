@@ -87,6 +87,20 @@ def write_report(values: dict[str, Any], path: Path | None) -> None:
         write_text_atomic(path, to_json(values) + "\n")
 
 
+def check_picture(path: Path | None) -> None:
+    """Raise QsgmError where a picture is asked for that cannot be drawn, before hours of work."""
+    if path is not None:
+        host_module("matplotlib")
+
+
+def draw(chart: str, values: dict[str, Any], path: Path | None) -> None:
+    """Write one of the charts of :mod:`qsgm.bench.charts` as a PNG file, if it was asked for."""
+    from qsgm.bench import charts
+
+    if path is not None:
+        charts.write_chart(getattr(charts, chart)(values), path)
+
+
 def open_bundle(folder: Path | None) -> "Bundle":
     """The bundle asked for, or the shipped one."""
     from qsgm.bundle import load_bundle

@@ -1,8 +1,11 @@
 """What the commands take: choices, options, and what their texts mean."""
 
+import math
+from collections.abc import Callable
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -12,11 +15,11 @@ from qsgm.errors import QsgmError
 from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
-    from qsgm.bench.calibration import Variant
     from qsgm.blocks import Blocks
     from qsgm.manifest import Precision
     from qsgm.tune.settings import Settings
 
+Value = TypeVar("Value")
 LARGEST_HIDDEN = 1024
 MOST_THREADS = 256
 LARGEST_SEED = 2**31 - 1  # what numpy and torch take both
@@ -231,72 +234,48 @@ def parsed_blocks(text: str) -> "Blocks":
     """Layers in groups, such as 1-4,5,6."""
     from qsgm.blocks import parse_blocks
 
+    return parsed(parse_blocks, text, "--blocks")
+
+
+def parsed(parse: Callable[[str], Value], text: str, option: str) -> Value:
+    """What an option's text means; where it means nothing, the command was called wrongly."""
     try:
-        return parse_blocks(text)
+        return parse(text)
     except QsgmError as error:
-        raise typer.BadParameter(str(error), param_hint="'--blocks'") from error
-
-
-def parsed_variant(text: str) -> "Variant":
-    """Bits and calibrator, such as 8/16/minmax."""
-    from qsgm.bench.calibration import parse_variant
-
-    try:
-        return parse_variant(text)
-    except QsgmError as error:
-        raise typer.BadParameter(str(error), param_hint="'--variant'") from error
+        raise typer.BadParameter(str(error), param_hint=f"'{option}'") from error
 
 
 def parsed_channels(text: str) -> tuple[int, ...]:
     """Channels of hidden layers, such as 64,64."""
-    channels = numbers(text)
-    if not all(1 <= count <= LARGEST_HIDDEN for count in channels):
-        raise typer.BadParameter(
-            f"{text!r} gives no channels: expected numbers of 1 to {LARGEST_HIDDEN}, such as 64,64",
-            param_hint="'--hidden'",
-        )
-    return channels
+    expected = f"no channels: expected numbers of 1 to {LARGEST_HIDDEN}, such as 64,64"
+    return _numbers(text, "--hidden", LARGEST_HIDDEN, expected)
 
 
 def parsed_run_lengths(text: str) -> tuple[int, ...]:
     """Epochs of runs, such as 1,3, or none."""
-    lengths = numbers(text) if text else ()
-    if not all(length >= 1 for length in lengths):
-        raise typer.BadParameter(
-            f"{text!r} gives no run lengths: expected numbers of epochs, such as 1,3",
-            param_hint="'--short'",
-        )
-    return lengths
+    expected = "no run lengths: expected numbers of epochs, such as 1,3"
+    return _numbers(text, "--short", math.inf, expected) if text else ()
 
 
 def parsed_layer_counts(text: str) -> tuple[int, ...]:
     """How many layers to tune, such as 3,6, or none."""
-    counts = numbers(text) if text else ()
-    if not all(1 <= count <= MOST_LAYERS for count in counts):
-        raise typer.BadParameter(
-            f"{text!r} gives no numbers of layers: expected 1 to {MOST_LAYERS}, such as 3,6",
-            param_hint="'--processes'",
-        )
-    return counts
+    expected = f"no numbers of layers: expected 1 to {MOST_LAYERS}, such as 3,6"
+    return _numbers(text, "--processes", MOST_LAYERS, expected) if text else ()
 
 
 def parsed_thread_counts(text: str) -> tuple[int, ...]:
     """Numbers of threads, such as 1,2, or none."""
-    counts = numbers(text) if text else ()
-    if not all(1 <= count <= MOST_THREADS for count in counts):
-        raise typer.BadParameter(
-            f"{text!r} gives no numbers of threads: expected 1 to {MOST_THREADS}, such as 1,2",
-            param_hint="'--thread-counts'",
-        )
-    return counts
+    expected = f"no numbers of threads: expected 1 to {MOST_THREADS}, such as 1,2"
+    return _numbers(text, "--thread-counts", MOST_THREADS, expected) if text else ()
 
 
-def numbers(text: str) -> tuple[int, ...]:
-    """Whole numbers between commas; a lone 0, which no option takes, for what is none."""
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        return (0,)
+def _numbers(text: str, option: str, most: float, expected: str) -> tuple[int, ...]:
+    """Whole numbers from 1 on, between commas."""
+    with suppress(ValueError):
+        found = tuple(int(part) for part in text.split(","))
+        if all(1 <= number <= most for number in found):
+            return found
+    raise typer.BadParameter(f"{text!r} gives {expected}", param_hint=f"'{option}'")
 
 
 def parsed_centers(texts: list[str] | None, frames: int) -> list[tuple[float, float] | None]:

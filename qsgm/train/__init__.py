@@ -16,24 +16,19 @@ if TYPE_CHECKING:
     from qsgm.train.task import DrawnTask
 else:
     # Imported when asked for, since most bring in torch.
-    _HOME = {
-        "Checkpoint": "qsgm.train.checkpoint",
-        "DrawnTask": "qsgm.train.task",
-        "ExportOptions": "qsgm.train.export",
-        "ExportReport": "qsgm.train.export_report",
-        "Lessons": "qsgm.train.quantization.lessons",
-        "PretrainConfig": "qsgm.train.pretraining.pretrain",
-        "SlimReport": "qsgm.train.slim",
-        "build": "qsgm.train.samples.build",
-        "export_bundle": "qsgm.train.export",
-        "from_torch": "qsgm.train.model.from_torch",
-        "load_checkpoint": "qsgm.train.checkpoint",
-        "pretrain": "qsgm.train.pretraining.pretrain",
-        "quicker": "qsgm.train.samples.drawn",
-        "save_checkpoint": "qsgm.train.checkpoint",
-        "slim_bundle": "qsgm.train.slim",
-        "usual_config": "qsgm.train.samples.drawn",
+    _NAMES = {
+        "qsgm.train.checkpoint": "Checkpoint load_checkpoint save_checkpoint",
+        "qsgm.train.export": "ExportOptions export_bundle",
+        "qsgm.train.export_report": "ExportReport",
+        "qsgm.train.model.from_torch": "from_torch",
+        "qsgm.train.pretraining.pretrain": "PretrainConfig pretrain",
+        "qsgm.train.quantization.lessons": "Lessons",
+        "qsgm.train.samples.build": "build",
+        "qsgm.train.samples.drawn": "quicker usual_config",
+        "qsgm.train.slim": "SlimReport slim_bundle",
+        "qsgm.train.task": "DrawnTask",
     }
+    _HOME = {name: home for home, names in _NAMES.items() for name in names.split()}
 
     def __getattr__(name: str) -> object:
         if name not in _HOME:
