@@ -1,13 +1,13 @@
-"""The SGM as a layer: nothing forward, its own gradient backward, and what its teacher is told."""
+"""The SGM, and local updates by it against torch's own backward pass (`SgmLayer`)."""
 
 import pytest
 import torch
+from sgm_layer import SgmLayer
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from qsgm.grasp.network import GRASPNET
 from qsgm.train.model.local import LayerState, local_step
-from qsgm.train.model.sgm import Sgm, SgmLayer, Teacher
+from qsgm.train.model.sgm import Sgm
 
 BATCH, LAYER = 6, 5
 SGM_LAYERS = range(1, 6)
@@ -22,11 +22,6 @@ class Case:
         self.conv, self.rest = nn.Conv2d(4, CHANNELS, 3), nn.Conv2d(CHANNELS, 2, 1)
         self.sgm = Sgm(GRASPNET, LAYER, hidden).eval()
         self.x, self.labels = torch.randn(BATCH, 4, 5, 5), torch.randn(BATCH, 3)
-        self.told: list[tuple[Tensor, Tensor]] = []
-
-    def teach(self, synthetic: Tensor, true: Tensor) -> None:
-        self.told.append((synthetic, true))
-        F.mse_loss(synthetic, true).backward()
 
     def loss(self, layer: SgmLayer | None) -> Tensor:
         activation = self.conv(self.x)
@@ -50,15 +45,6 @@ def test_a_gradient_has_its_activations_shape(layer: int, hidden: tuple[int, ...
     assert Sgm(GRASPNET, layer, hidden)(activation, torch.randn(2, 3)).shape == activation.shape
 
 
-@pytest.mark.parametrize("teacher", [None, lambda *_: None])
-def test_forward_changes_no_bit(teacher: Teacher | None) -> None:
-    case = Case()
-    activation = torch.randn(BATCH, CHANNELS, 3, 3)
-    activation[0, 0, 0, :] = torch.tensor([-0.0, float("inf"), 1e-45])
-    behind = SgmLayer(case.sgm, teacher)(activation, case.labels)
-    assert torch.equal(behind.view(torch.int32), activation.view(torch.int32))
-
-
 def test_what_lies_before_trains_on_the_synthetic_gradient_over_the_batch() -> None:
     case = Case()
     case.loss(SgmLayer(case.sgm)).backward()
@@ -75,43 +61,6 @@ def test_what_lies_before_trains_on_the_synthetic_gradient_over_the_batch() -> N
     case.loss(None).backward()
     for one, other in zip(rest, gradients(case.rest), strict=True):
         torch.testing.assert_close(one, other)
-
-
-def test_the_teacher_is_told_every_samples_own_true_gradient() -> None:
-    case = Case()
-    case.loss(SgmLayer(case.sgm, case.teach)).backward()
-    ((synthetic, true),) = case.told
-    activation = case.conv(case.x).detach()
-    torch.testing.assert_close(synthetic, case.sgm(activation, case.labels))
-    for i in range(BATCH):  # of one sample's loss alone
-        one = activation[i : i + 1].clone().requires_grad_()
-        (expected,) = torch.autograd.grad(case.rest(one).square().sum(), one)
-        torch.testing.assert_close(true[i : i + 1], expected, rtol=1e-5, atol=1e-5)
-
-
-def test_only_the_teacher_gives_the_sgm_gradients() -> None:
-    alone, taught = Case(), Case()
-    alone.loss(SgmLayer(alone.sgm)).backward()
-    taught.loss(SgmLayer(taught.sgm, taught.teach)).backward()
-    assert gradients(alone.sgm) == [None] * len(list(alone.sgm.parameters()))
-    _, true = taught.told[0]
-    objective = F.mse_loss(taught.sgm(taught.conv(taught.x).detach(), taught.labels), true)
-    expected = torch.autograd.grad(objective, list(taught.sgm.parameters()))
-    for one, other in zip(gradients(taught.sgm), expected, strict=True):
-        assert one is not None
-        torch.testing.assert_close(one, other)
-    for one, other in zip(gradients(alone.conv), gradients(taught.conv), strict=True):
-        assert one is not None
-        torch.testing.assert_close(one, other)
-
-
-def test_before_another_sgm_a_teacher_is_told_that_ones_gradient() -> None:
-    case, behind = Case(), Sgm(GRASPNET, LAYER).eval()
-    activation = torch.randn(BATCH, CHANNELS, 1, 1, requires_grad=True)
-    told = SgmLayer(case.sgm, lambda _, incoming: case.told.append((incoming, incoming)))
-    case.rest(SgmLayer(behind)(told(activation, case.labels), case.labels)).mean().backward()
-    expected = behind(activation.detach(), case.labels)
-    torch.testing.assert_close(case.told[0][0], expected.detach())
 
 
 @pytest.mark.parametrize("hidden", [None, (64, 64)])

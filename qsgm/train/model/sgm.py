@@ -8,9 +8,8 @@ SGM; two wider ones are the default here (the README's design notes say why). Th
 none: its gradient comes from the loss.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -48,50 +47,3 @@ class Sgm(nn.Module):
             x = F.relu(norm(conv(x)))
         gradient: Tensor = self.convs[-1](x)
         return gradient
-
-
-# (synthetic, true): per-sample gradients (N, C, H, W); the synthetic one carries the SGM's graph
-Teacher = Callable[[Tensor, Tensor], None]
-
-
-class SgmLayer(nn.Module):
-    """An SGM as a layer of a network, as the paper has it.
-
-    Forward it is a no-op. Backward it puts its synthetic gradient in the place of the incoming
-    one, so that everything before it trains on that. With a teacher it can learn from the
-    incoming gradient: the true one, as long as no SGM follows.
-    """
-
-    def __init__(self, sgm: Sgm, teacher: Teacher | None = None) -> None:
-        super().__init__()
-        self.sgm, self.teacher = sgm, teacher
-
-    def forward(self, activation: Tensor, labels: Tensor) -> Tensor:
-        """Activation (N, C, H, W), returned as it is, and labels (N, L).
-
-        The network's loss has to be a mean over the N samples.
-        """
-        with torch.enable_grad():
-            synthetic = self.sgm(activation.detach(), labels)
-        # In a tuple, so that autograd does not take the SGM for a part of the network's graph.
-        result: Tensor = _Substitute.apply(activation, (synthetic,), self.teacher)  # type: ignore[no-untyped-call]
-        return result
-
-
-class _Substitute(torch.autograd.Function):
-    """Identity whose gradient is the synthetic one, of a batch's mean loss."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, activation: Tensor, synthetic: tuple[Tensor], teacher: Teacher | None
-    ) -> Tensor:
-        ctx.synthetic, ctx.teacher = synthetic[0], teacher
-        return activation.view_as(activation)
-
-    @staticmethod
-    def backward(ctx: Any, incoming: Tensor) -> tuple[Tensor, None, None]:
-        batch = len(incoming)
-        if ctx.teacher is not None:
-            with torch.enable_grad():
-                ctx.teacher(ctx.synthetic, incoming.detach() * batch)
-        return ctx.synthetic.detach() / batch, None, None

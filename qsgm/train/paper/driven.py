@@ -1,10 +1,9 @@
 """Layers that keep their batchnorm, trained by SGMs: the paper's own setting (section 3.2).
 
 A layer is updated by the gradient its SGM makes of its activation and the label. The true gradients
-are carried back beside, for SGMs that follow them. :class:`qsgm.train.model.sgm.SgmLayer` does this
-in a network's own backward pass; with several of them in a row, though, what reaches one is the
-next one's synthetic gradient. Here autograd goes back one layer at a time, so that all can follow
-the truth.
+are carried back beside, for SGMs that follow them. In one backward pass through several SGMs in a
+row, what reaches one is the next one's synthetic gradient. Here autograd goes back one layer at a
+time, so that all can follow the truth.
 """
 
 from collections.abc import Callable, Mapping, Sequence

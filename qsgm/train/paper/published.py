@@ -1,14 +1,12 @@
 """The figures that Neven et al. (2020) print: Table 1 ("fixed SGMs") and Table 2, by object a to f.
 
-Table 1's averages and spreads are not those of the six columns it shows, but of seven objects:
-:data:`SEVENTH_OBJECT` follows from the averages, and with it the spreads come out as printed. Table
-2 leaves out Table 1's c: its c, d and e are d, e and f there, and its f is the seventh.
+Table 1's averages and spreads are not those of the six columns it shows, but of seven objects: the
+seventh follows from the averages, and with it the spreads come out as printed. Table 2 leaves out
+Table 1's c: its c, d and e are d, e and f there, and its f is the seventh.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-
-import numpy as np
 
 Six = tuple[float, float, float, float, float, float]
 
@@ -20,11 +18,6 @@ class Published:
     values: Six
     average: float
     spread: float
-
-    @property
-    def mean(self) -> float:
-        """Of the six values."""
-        return float(np.mean(self.values))
 
 
 @dataclass(frozen=True)
@@ -71,10 +64,4 @@ TABLE_2: Mapping[str, PublishedSystem] = {
         Published((0.97, 0.98, 0.98, 0.99, 0.99, 0.97), 0.98, 0.01),
         Published((23.32, 18.87, 26.53, 30.56, 13.27, 22.22), 22.46, 5.48),
     ),
-}
-
-# Angle errors [deg] of the object that Table 1 averages over and does not show: seven times the
-# average less the six values. Table 2 prints that of the SGMs, 21.77, in its last column.
-SEVENTH_OBJECT: Mapping[str, float] = {
-    name: round(7 * row.angle.average - sum(row.angle.values), 2) for name, row in TABLE_1.items()
 }
