@@ -1,6 +1,5 @@
 """The exported bundle: a folder of ONNX graphs and the manifest that describes them."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from qsgm.blocks import Blocks, one_block, parse_blocks
 from qsgm.errors import QsgmError
-from qsgm.files import read_file, read_whole
+from qsgm.files import read_file, read_whole, sha256
 from qsgm.manifest import (
     COMMAND,
     FORMAT,
@@ -172,7 +171,7 @@ class Bundle:
 
     def sha256(self) -> str:
         """Digest of the manifest, and so of everything in the bundle."""
-        return hashlib.sha256(self.read(MANIFEST)).hexdigest()
+        return sha256(self.read(MANIFEST))
 
 
 def array_at(data: bytes, place: Place) -> NDArray[np.float32]:
@@ -199,7 +198,7 @@ def _load_bundle(folder: Path) -> Bundle:
     for name, expected in manifest.files.items():
         contents[name] = read_file(folder / name, left, f"a file that `{COMMAND}` wrote")
         left -= len(contents[name])
-        if hashlib.sha256(contents[name]).hexdigest() != expected.sha256:
+        if sha256(contents[name]) != expected.sha256:
             raise QsgmError(
                 f"{folder / name} is not the file the manifest describes (its sha256 differs); "
                 f"export the bundle again with `{COMMAND}`"

@@ -104,6 +104,11 @@ def _is_between(folder: Path) -> bool:
     return False
 
 
+def sha256(data: bytes) -> str:
+    """Digest in hexadecimal digits."""
+    return hashlib.sha256(data).hexdigest()
+
+
 def is_plain(name: object) -> TypeGuard[str]:
     """Whether it names a file right in its folder, and fits into a line of a message."""
     return (
@@ -269,9 +274,7 @@ def _entries(folder: Path) -> Iterator[str]:
 def _write_listing(folder: Path) -> None:
     """Write the listing in the format of ``sha256sum``, and everything to the disk."""
     names = sorted({*_entries(folder)} - {LISTING})
-    lines = [
-        f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names
-    ]
+    lines = [f"{sha256((folder / name).read_bytes())}  {name}\n" for name in names]
     (folder / LISTING).write_text("".join(lines), encoding="utf-8")
     for path in (folder, *folder.rglob("*")):
         _sync(path)

@@ -1,7 +1,6 @@
 """Where things are when no flag says so: the shipped artifacts and the last tuned object."""
 
 import errno
-import hashlib
 import os
 import re
 from contextlib import suppress
@@ -9,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from qsgm.errors import QsgmError
-from qsgm.files import read_file, write_bytes_atomic
+from qsgm.files import read_file, sha256, write_bytes_atomic
 
 _LONGEST_NAME = 60  # letters of four bytes at most, where systems allow 255 bytes
 _LONGEST_PATH = 10_000
@@ -55,7 +54,7 @@ def folder_named(name: str) -> Path:
     """
     kept = re.sub(r"[^\w.-]+", "_", name)[:_LONGEST_NAME].strip("._")
     if kept != name:
-        digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+        digest = sha256(os.fsencode(name))[:8]
         kept = f"{kept}-{digest}" if kept else f"object-{digest}"
     return objects_folder() / kept
 

@@ -1,6 +1,5 @@
 """A tuned folder, whatever its task: a network, what is to be known of it, the run's report."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from qsgm.errors import QsgmError
-from qsgm.files import is_plain, new_folder, read_file
+from qsgm.files import is_plain, new_folder, read_file, sha256
 from qsgm.manifest import NETWORK
 
 FORMAT = "qsgm-object"
@@ -60,8 +59,3 @@ def unaltered(folder: Path, name: object, digest: object, most_bytes: int, advic
     if sha256(data) != digest:
         raise QsgmError(f"{folder / name} is altered: its sha256 differs; {advice}")
     return data
-
-
-def sha256(data: bytes) -> str:
-    """A digest in hexadecimal."""
-    return hashlib.sha256(data).hexdigest()

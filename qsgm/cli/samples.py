@@ -1,6 +1,5 @@
 """What the commands do for networks of one's own; see :mod:`qsgm.samples`."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ import typer
 
 from qsgm.cli.console import host_module, print_json, progress, show, tell
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import read_file
+from qsgm.files import read_file, sha256
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
@@ -35,7 +34,7 @@ def pretrain_task(
     task = _host_task(file)
     host = host_module("qsgm.train.samples.build")
     sizes = host.usual_config(task, **chosen)
-    source = hashlib.sha256(read_file(file, _MOST_BYTES, "a task file")).hexdigest()
+    source = sha256(read_file(file, _MOST_BYTES, "a task file"))
     with progress() as watch:
         said = f" --task {as_text(file.name)}"
         made = host.pretrain_samples(task, output, seed, device, watch, sizes, None, said, source)

@@ -1,6 +1,5 @@
 """Things that the user names: `finetune --not` puts them onto crops beside the drawn ones."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from qsgm.files import sha256
 from qsgm.grasp.distractors import TILE_PX, Distractors, with_named
 from qsgm.grasp.measuring import measured_span, moved_point, scaled_frame
 from qsgm.grasp.patch import PATCH_PX, Patch, cut_patch
@@ -29,7 +29,7 @@ class Other:
     def sha256(self) -> str:
         """Digest of its pixels and its mask."""
         pixels = np.dstack([self.patch.image, self.patch.mask])
-        return hashlib.sha256(pixels.tobytes()).hexdigest()
+        return sha256(pixels.tobytes())
 
 
 def other_in(demonstration: Demonstration) -> Other:

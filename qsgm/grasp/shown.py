@@ -5,11 +5,11 @@ says how far it is turned there; where it does not, as from its other side, that
 patch of its own.
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from qsgm.errors import QsgmError
+from qsgm.files import sha256
 from qsgm.grasp.judge import Appearance, best_fit
 from qsgm.grasp.measuring import (
     LARGEST_SPAN_PX,
@@ -82,7 +82,7 @@ def shown(demonstrations: Sequence[Demonstration], span_px: float | None = None)
     ready = [with_room(_scaled(*both)) for both in zip(demonstrations, scales, strict=True)]
     patches = [cut_patch(one.frame, one.center_px) for one in ready]
     turns = (0.0, *_turns_since(patches[0], ready[1:]))
-    sums = tuple(hashlib.sha256(one.frame.tobytes()).hexdigest() for one in demonstrations)
+    sums = tuple(sha256(one.frame.tobytes()) for one in demonstrations)
     return Shown(tuple(ready), tuple(patches), turns, measured, scale, sums)
 
 

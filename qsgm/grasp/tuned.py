@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import read_file, read_whole
+from qsgm.files import read_file, read_whole, sha256
 from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
@@ -37,7 +37,6 @@ from qsgm.tuned_folder import (
     DESCRIPTION,
     FORMAT,
     VERSION,
-    sha256,
     unaltered,
     write_tuned,
 )

@@ -133,8 +133,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise QsgmError(
             f"{path} does not fit this version of qsgm ({_one_line(error)}); {_MEND}"
         ) from error
-    _check_finite(path, net, *sgms.values())
-    _check_curvatures(path, curvatures)
+    for module in (net, *sgms.values()):
+        for name, value in module.state_dict().items():
+            _check_finite(path, name, value)
+    for layer, one in curvatures.items():
+        _check_finite(path, f"the curvature of layer {layer}", *one.matrices)
     return checkpoint
 
 
@@ -242,16 +245,6 @@ def _one_line(error: BaseException) -> str:
     return first if first and first.isprintable() else type(error).__name__
 
 
-def _check_curvatures(path: Path, curvatures: Mapping[int, Curvature]) -> None:
-    for layer, curvature in curvatures.items():
-        if not all(torch.isfinite(matrix).all() for matrix in curvature.matrices):
-            raise QsgmError(
-                f"{path}: the curvature of layer {layer} holds NaN or infinity; {_MEND}"
-            )
-
-
-def _check_finite(path: Path, *modules: torch.nn.Module) -> None:
-    for module in modules:
-        for name, value in module.state_dict().items():
-            if not torch.isfinite(value).all():
-                raise QsgmError(f"{path}: {name} holds NaN or infinity; {_MEND}")
+def _check_finite(path: Path, name: str, *values: torch.Tensor) -> None:
+    if not all(torch.isfinite(value).all() for value in values):
+        raise QsgmError(f"{path}: {name} holds NaN or infinity; {_MEND}")

@@ -4,7 +4,6 @@ Fold batchnorm, take ranges along fine-tuning runs on the calibration set, quant
 graph, and write them with the manifest that :mod:`qsgm.bundle` reads.
 """
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from onnx import ModelProto
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
-from qsgm.files import check_replaceable, new_folder
+from qsgm.files import check_replaceable, new_folder, sha256
 from qsgm.manifest import (
     MANIFEST,
     NETWORK,
@@ -452,8 +451,3 @@ def sgm_recipe(checkpoint: Checkpoint, blocks: Blocks, name: OptimizerName) -> R
     single = checkpoint.rates[str(single_layers(blocks.layers))]
     gains = known[late, name].gains if (late, name) in known else ()
     return Recipe(name, checkpoint.rates.get(str(blocks), single), gains)
-
-
-def sha256(data: bytes) -> str:
-    """Digest in hexadecimal digits."""
-    return hashlib.sha256(data).hexdigest()

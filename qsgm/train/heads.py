@@ -54,11 +54,11 @@ class LogLoss:
     def value(self, head: Head, raw: Tensor, labels: Tensor) -> Tensor:
         from torch.nn import functional as F
 
-        target = self._target(head, labels)
+        target = smoothed(head, labels, 2)
         return F.binary_cross_entropy_with_logits(raw, target, reduction="none").sum(dim=-1)
 
     def error(self, head: Head, raw: Tensor, labels: Tensor) -> Tensor:
-        return raw.sigmoid() - self._target(head, labels)
+        return raw.sigmoid() - smoothed(head, labels, 2)
 
     def graph_activate(self, op: Ops, head: Head, raw: Value) -> Value:  # noqa: ARG002
         return op.Sigmoid(raw)
@@ -66,17 +66,11 @@ class LogLoss:
     def graph(
         self, op: Ops, head: Head, raw: Value, labels: Value, gate: Value | None
     ) -> tuple[Value, Value]:
-        smoothing, target = head.smoothing, labels
-        if smoothing:
-            kept = op.Mul(labels, op.constant(1 - smoothing))
-            target = op.Add(kept, op.constant(smoothing / 2))
+        target = smoothed_in_graph(op, head, labels, 2)
         each = op.Sub(op.Softplus(raw), op.Mul(target, raw))
         error = op.Sub(op.Sigmoid(raw), target)
         each, error = (weighed(op, x, head.weight, gate) for x in (each, error))
         return batch_mean(op, each, head.channels), error
-
-    def _target(self, head: Head, labels: Tensor) -> Tensor:
-        return labels * (1 - head.smoothing) + head.smoothing / 2
 
 
 class Squared:
@@ -118,10 +112,10 @@ class CrossEntropy:
         return raw.softmax(dim=-1)
 
     def value(self, head: Head, raw: Tensor, labels: Tensor) -> Tensor:
-        return -(self._target(head, labels) * raw.log_softmax(dim=-1)).sum(dim=-1)
+        return -(smoothed(head, labels, head.channels) * raw.log_softmax(dim=-1)).sum(dim=-1)
 
     def error(self, head: Head, raw: Tensor, labels: Tensor) -> Tensor:
-        return raw.softmax(dim=-1) - self._target(head, labels)
+        return raw.softmax(dim=-1) - smoothed(head, labels, head.channels)
 
     def graph_activate(self, op: Ops, head: Head, raw: Value) -> Value:  # noqa: ARG002
         return op.Softmax(raw, axis=1)
@@ -129,17 +123,11 @@ class CrossEntropy:
     def graph(
         self, op: Ops, head: Head, raw: Value, labels: Value, gate: Value | None
     ) -> tuple[Value, Value]:
-        target = labels
-        if head.smoothing:
-            kept = op.Mul(labels, op.constant(1 - head.smoothing))
-            target = op.Add(kept, op.constant(head.smoothing / head.channels))
+        target = smoothed_in_graph(op, head, labels, head.channels)
         each = op.Neg(op.Mul(target, op.LogSoftmax(raw, axis=1)))
         error = op.Sub(op.Softmax(raw, axis=1), target)
         each, error = (weighed(op, x, head.weight, gate) for x in (each, error))
         return batch_mean(op, each, head.channels), error
-
-    def _target(self, head: Head, labels: Tensor) -> Tensor:
-        return labels * (1 - head.smoothing) + head.smoothing / head.channels
 
 
 LOSSES: Mapping[LossKind, HeadLoss] = {
@@ -147,6 +135,19 @@ LOSSES: Mapping[LossKind, HeadLoss] = {
     "squared": Squared(),
     "cross_entropy": CrossEntropy(),
 }
+
+
+def smoothed(head: Head, labels: Tensor, classes: int) -> Tensor:
+    """Labels (..., C) of so many classes drawn together by the head's smoothing."""
+    return labels * (1 - head.smoothing) + head.smoothing / classes
+
+
+def smoothed_in_graph(op: Ops, head: Head, labels: Value, classes: int) -> Value:
+    """:func:`smoothed` in a graph; labels as they are where the head has no smoothing."""
+    if not head.smoothing:
+        return labels
+    kept = op.Mul(labels, op.constant(1 - head.smoothing))
+    return op.Add(kept, op.constant(head.smoothing / classes))
 
 
 def weighed(op: Ops, x: Value, weight: float, gate: Value | None) -> Value:

@@ -7,7 +7,6 @@ taken out. `qsgm bench` of speed, memory, resources and growth compares steps th
 bundle has.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from typing import Any
 from qsgm.blocks import Blocks, one_block
 from qsgm.bundle import Bundle
 from qsgm.errors import QsgmError
-from qsgm.files import check_replaceable, new_folder
+from qsgm.files import check_replaceable, new_folder, sha256
 from qsgm.manifest import (
     MANIFEST,
     NETWORK,
@@ -178,7 +177,7 @@ def task_names(manifest: Manifest) -> list[str]:
 
 def kept_entry(bundle: Bundle, name: str, data: bytes) -> FileEntry:
     """What the manifest says of a file: what it holds, and of a step the memory it takes."""
-    return FileEntry(hashlib.sha256(data).hexdigest(), bundle.peak_activation_bytes(name))
+    return FileEntry(sha256(data), bundle.peak_activation_bytes(name))
 
 
 def kept_manifest(manifest: Manifest, blocks: Blocks) -> Manifest:

@@ -115,7 +115,7 @@ def test_a_local_step_and_true_gradients_are_autograds(shape: Shape, data: st.Da
         return made_up(layer, activation, labels)
 
     rates = [torch.tensor(0.1 * k, dtype=torch.float64) for k in tasks[0]]
-    updated = local_step(network, states, features, labels, rates, gradient_of, momentum=0.9)
+    updated = local_step(network, states, features, labels, rates, gradient_of)
     raw = outputs(network, states, features)
     true = true_gradients(network, states, features, labels, case.heads)
     assert set(true) == set(tasks[0])

@@ -259,7 +259,7 @@ def test_static_sgms_tune_as_the_local_steps_do(tuned: int) -> None:
     for step, rows in enumerate(batches):
         features, labels = tasks.features[:, rows].float(), tasks.labels[:, rows]
         now = [torch.tensor(rate * (1 - step / len(batches))) for rate in rates]
-        states = local_step(GRASPNET, states, features, labels, now, gradient_of, 0.9)
+        states = local_step(GRASPNET, states, features, labels, now, gradient_of)
     assert scores.shape == (TASKS, 3)
     torch.testing.assert_close(scores, figures(score(states, tasks, TASK)), atol=1e-4, rtol=1e-4)
     for layer, sgm in sgms.items():

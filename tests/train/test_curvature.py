@@ -39,10 +39,8 @@ def test_a_local_step_descends_along_the_bent_gradient() -> None:
     def gradient_of(_: int, activation: torch.Tensor, __: torch.Tensor) -> torch.Tensor:
         return activation.cos()
 
-    (plain,) = local_step(GRASPNET, [state], features, labels, rate, gradient_of, 0.9)
-    (bent,) = local_step(
-        GRASPNET, [state], features, labels, rate, gradient_of, 0.9, {6: curvature}
-    )
+    (plain,) = local_step(GRASPNET, [state], features, labels, rate, gradient_of)
+    (bent,) = local_step(GRASPNET, [state], features, labels, rate, gradient_of, {6: curvature})
     expected = curvature.precondition(plain.weight_momentum, plain.bias_momentum)
     torch.testing.assert_close((bent.weight_momentum, bent.bias_momentum), expected)
     torch.testing.assert_close(bent.weight, state.weight - 0.1 * expected[0])

@@ -110,8 +110,8 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
         return made_up_gradient(layer, activation, labels)
 
     rates = [torch.tensor(RATES[number], dtype=DTYPE) for number in tasks[0]]
-    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of, momentum=0.9)
-    twice = local_step(GRASPNET, updated, features, labels, rates, gradient_of, momentum=0.9)
+    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of)
+    twice = local_step(GRASPNET, updated, features, labels, rates, gradient_of)
     for task, weights in enumerate(tasks):
         x = as_map(features[task])
         for index, number in enumerate(weights):
@@ -132,7 +132,7 @@ def test_a_local_step_equals_autograd_with_the_gradient_injected(tuned: int) -> 
             assert_equal(once.bias[task], before.bias[task] - RATES[number] * bias)
     # The second step is a first one from there, but for the momentum, which remembers.
     forgetful = [LayerState.start(once.weight, once.bias) for once in updated]
-    fresh = local_step(GRASPNET, forgetful, features, labels, rates, gradient_of, momentum=0.9)
+    fresh = local_step(GRASPNET, forgetful, features, labels, rates, gradient_of)
     for rate, once, anew, second in zip(rates, updated, fresh, twice, strict=True):
         momentum = 0.9 * once.weight_momentum + anew.weight_momentum
         assert_equal(second.weight_momentum, momentum)
@@ -190,7 +190,7 @@ def test_meta_gradients_flow_through_a_step() -> None:
         return scale[0] * made_up_gradient(layer, activation, labels)
 
     rates = [scale[1] * 0.1, torch.tensor(0.1, dtype=DTYPE)]
-    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of, momentum=0.9)
+    updated = local_step(GRASPNET, states, features, labels, rates, gradient_of)
     raw = outputs(GRASPNET, updated, features)
     GraspLoss()(raw.flatten(0, 1), labels.flatten(0, 1)).backward()
     assert scale.grad is not None

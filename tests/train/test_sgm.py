@@ -89,9 +89,7 @@ def test_a_local_update_equals_autograd_through_the_sgm_layer(
     rates = [torch.tensor(1.0), torch.tensor(0.0)]
     seen = features.flatten(2).transpose(1, 2)[None]
     with torch.no_grad():
-        updated = local_step(
-            GRASPNET, states, seen, labels[None], rates, gradient_of, momentum=0.9
-        )[0]
+        updated = local_step(GRASPNET, states, seen, labels[None], rates, gradient_of)[0]
         weight, bias = (parameter - parameter.grad for parameter in conv.parameters())
     torch.testing.assert_close(updated.weight[0], weight.flatten(1).T, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(updated.bias[0], bias, rtol=1e-5, atol=1e-5)

@@ -1,6 +1,5 @@
 """The calibration set: demonstration frames in a folder, and the manifest that vouches for them."""
 
-import hashlib
 import json
 from dataclasses import dataclass
 from math import isfinite
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.files import is_plain, read_file
+from qsgm.files import is_plain, read_file, sha256
 from qsgm.grasp.lesson import GraspLesson
 from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask
@@ -59,7 +58,7 @@ class CalibrationSet:
         data = read_file(path, MAX_FILE_BYTES, "a frame")
         image = decode_frame(data, path)
         check_demonstration(image, path)
-        if hashlib.sha256(data).hexdigest() != entry.sha256:
+        if sha256(data) != entry.sha256:
             raise QsgmError(
                 f"{path} is not the frame the manifest describes (its sha256"
                 " differs); restore it or make the set again with `qsgm draw-calibration`"
@@ -86,7 +85,7 @@ class CalibrationLessons:
     @property
     def sha256(self) -> str:
         """Digest of the manifest, and so of every frame."""
-        return hashlib.sha256(self.frames.manifest_bytes).hexdigest()
+        return sha256(self.frames.manifest_bytes)
 
     def lesson(self, i: int, rng: np.random.Generator, count: int) -> GraspLesson:
         """Crops of a frame, with other things on them as the device has them."""

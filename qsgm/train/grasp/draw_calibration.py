@@ -1,6 +1,5 @@
 """`qsgm draw-calibration`: demonstration frames for calibration, all drawn, none photographed."""
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import cv2
 import numpy as np
 
 from qsgm import defaults
-from qsgm.files import new_folder
+from qsgm.files import new_folder, sha256
 from qsgm.images import write_png
 from qsgm.progress import Progress
 from qsgm.train.grasp.draw_demo import draw_demo
@@ -98,7 +97,7 @@ def _write_frame(folder: Path, name: str, drawn: DrawnFrame, seed: list[int]) ->
         "object_kind": drawn.object_kind,
         "table_kind": drawn.table_kind,
         "seed": seed,
-        "sha256": hashlib.sha256(data).hexdigest(),
+        "sha256": sha256(data),
         "center_px": list(CENTER_PX),
     }
 

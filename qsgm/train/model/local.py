@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from qsgm.network import ONE, Network, Pair
+from qsgm.schedule import MOMENTUM
 from qsgm.task import Heads
 from qsgm.train import heads as losses
 from qsgm.train.model.curvature import FLAT, Curvature
@@ -35,13 +36,18 @@ class LayerState:
     def start(weight: Tensor, bias: Tensor) -> "LayerState":
         return LayerState(weight, bias, torch.zeros_like(weight), torch.zeros_like(bias))
 
-    def detach(self) -> "LayerState":
-        return LayerState(
-            self.weight.detach(),
-            self.bias.detach(),
-            self.weight_momentum.detach(),
-            self.bias_momentum.detach(),
-        )
+    @staticmethod
+    def joined(states: "Sequence[LayerState]") -> "LayerState":
+        """Several ones side by side on the task axis."""
+        return LayerState(*(torch.cat(some) for some in zip(*map(_tensors, states), strict=True)))
+
+    def of_task(self, i: int) -> "LayerState":
+        """One task's part, without its history."""
+        return LayerState(*(one[i : i + 1].detach() for one in _tensors(self)))
+
+
+def _tensors(state: LayerState) -> tuple[Tensor, ...]:
+    return state.weight, state.bias, state.weight_momentum, state.bias_momentum
 
 
 def window_index(side: Pair, kernel: Pair, stride: Pair) -> Tensor:
@@ -118,7 +124,6 @@ def local_step(
     labels: Tensor,
     rates: Sequence[Tensor],
     gradient_of: GradientOf,
-    momentum: float,
     curvatures: Mapping[int, Curvature] = FLAT,
 ) -> list[LayerState]:
     """One feed-forward training step: every layer updates itself before the next one runs.
@@ -130,12 +135,11 @@ def local_step(
         labels: (T, B, L).
         rates: one learning rate per layer, a scalar or one per task, (T,).
         gradient_of: where the gradient on an activation comes from (the last one: the loss).
-        momentum: of SGD.
         curvatures: by layer, where there is one.
     """
     given = local_gradients(network, states, features, labels, gradient_of, curvatures)
     return [
-        sgd(state, *gradients, rate, momentum)
+        sgd(state, *gradients, rate)
         for state, gradients, rate in zip(states, given, rates, strict=True)
     ]
 
@@ -161,12 +165,10 @@ def local_gradients(
         yield curvatures[layer].precondition(*gradients) if layer in curvatures else gradients
 
 
-def sgd(
-    state: LayerState, d_weight: Tensor, d_bias: Tensor, rate: Tensor, momentum: float
-) -> LayerState:
+def sgd(state: LayerState, d_weight: Tensor, d_bias: Tensor, rate: Tensor) -> LayerState:
     """SGD with momentum as torch has it (no dampening); the rate a scalar or (T,)."""
-    weight_momentum = momentum * state.weight_momentum + d_weight
-    bias_momentum = momentum * state.bias_momentum + d_bias
+    weight_momentum = MOMENTUM * state.weight_momentum + d_weight
+    bias_momentum = MOMENTUM * state.bias_momentum + d_bias
     return LayerState(
         state.weight - rate.view(-1, 1, 1) * weight_momentum,
         state.bias - rate.view(-1, 1) * bias_momentum,

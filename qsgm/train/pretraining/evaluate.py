@@ -12,7 +12,7 @@ from torch import Tensor
 from qsgm.blocks import Blocks
 from qsgm.errors import QsgmError
 from qsgm.manifest import OptimizerName
-from qsgm.schedule import MOMENTUM, rate_factor
+from qsgm.schedule import rate_factor
 from qsgm.task import Task
 from qsgm.train.heads import activate, error, meta_objective
 from qsgm.train.model.curvature import Curvature
@@ -95,7 +95,7 @@ def _step(
         found = group_gradients(network, groups, states, features, labels, gradient_of)
         gradient_of = _known(found)
     scalars = [torch.tensor(rate) for rate in rates]
-    return local_step(network, states, features, labels, scalars, gradient_of, MOMENTUM, bent)
+    return local_step(network, states, features, labels, scalars, gradient_of, bent)
 
 
 def _known(gradients: Mapping[int, Tensor]) -> GradientOf:

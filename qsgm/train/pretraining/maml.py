@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from qsgm.schedule import BATCH, MOMENTUM, rate_factor
+from qsgm.schedule import BATCH, rate_factor
 from qsgm.task import Task
 from qsgm.train.heads import error, meta_objective
 from qsgm.train.model.curvature import Curvature
@@ -187,7 +187,7 @@ class MetaTraining:
     def _keep(self, chosen: list[Run], states: list[LayerState], query: Tensor) -> None:
         """Store where each run has got to; a new one takes the place of what is done or lost."""
         for i, run in enumerate(chosen):
-            run.states = [_of_task(state, i) for state in states]
+            run.states = [state.of_task(i) for state in states]
             run.age += self.config.unroll
             sound = all(torch.isfinite(state.weight).all() for state in run.states)
             if run.age >= run.length or not sound or not query[i] < LOST:
@@ -220,7 +220,8 @@ class _Unrolled:
         rows = [run.task for run in chosen]
         self.features = training.tasks.features[rows].to(training.log_rates.dtype)  # (T, N, P, C)
         self.labels = training.tasks.labels[rows]  # (T, N, L)
-        self.states = _join([run.states or self._start() for run in chosen])
+        runs = [run.states or self._start() for run in chosen]
+        self.states = [LayerState.joined(some) for some in zip(*runs, strict=True)]
         self.rates = training.log_rates.exp().unbind()
         self.way = torch.zeros(len(chosen))
         self.mismatch = torch.zeros(len(chosen))
@@ -249,7 +250,6 @@ class _Unrolled:
             labels,
             [rate * factor for rate in self.rates],
             gradient_of,
-            MOMENTUM,
             self.training.curvatures,
         )
         self.ages = [age + 1 for age in self.ages]
@@ -300,24 +300,3 @@ def apply_sgm(sgm: Sgm, activation: Tensor, labels: Tensor) -> Tensor:
     """An SGM on the activations (T, B, P, C) of many tasks, maps row by row."""
     gradient = sgm(maps_of(activation.flatten(0, 1), sgm.side), labels.flatten(0, 1))
     return positions_of(gradient).reshape(activation.shape)
-
-
-def _join(runs: list[list[LayerState]]) -> list[LayerState]:
-    """States of several runs, layer by layer, side by side on the task axis."""
-    return [
-        LayerState(
-            *(
-                torch.cat([getattr(run[i], name) for run in runs])
-                for name in ("weight", "bias", "weight_momentum", "bias_momentum")
-            )
-        )
-        for i in range(len(runs[0]))
-    ]
-
-
-def _of_task(state: LayerState, i: int) -> LayerState:
-    """One task's part of a joint state, without its history."""
-    one = slice(i, i + 1)
-    return LayerState(
-        state.weight[one], state.bias[one], state.weight_momentum[one], state.bias_momentum[one]
-    ).detach()

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from qsgm.schedule import MOMENTUM
 from qsgm.task import Task
 from qsgm.train.model.local import LayerState, local_step, true_gradients
 from qsgm.train.model.net import maps_of, positions_of
@@ -105,7 +104,7 @@ def backprop_step(
         return gradients[layer]
 
     rate_tensors = [torch.tensor(rate) for rate in rates]
-    states = local_step(network, states, features, labels, rate_tensors, gradient_of, MOMENTUM)
+    states = local_step(network, states, features, labels, rate_tensors, gradient_of)
     return states, activations, gradients
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from qsgm.schedule import MOMENTUM, rate_factor
+from qsgm.schedule import rate_factor
 from qsgm.task import Task
 from qsgm.train.heads import error
 from qsgm.train.model.local import GradientOf, local_step, true_gradients
@@ -94,7 +94,7 @@ def looks_along(
             true = true_gradients(network, states, features, labels, task.heads)
         gradient_of = _driven_by(sgms, true, activations, task)
         now = [torch.tensor(rate * rate_factor(step, len(batches))) for rate in rates]
-        states = local_step(network, states, features, labels, now, gradient_of, MOMENTUM)
+        states = local_step(network, states, features, labels, now, gradient_of)
         for layer in network.last(len(start))[:-1] if looking else ():
             bound = bounds.setdefault(layer, LOST_ACTIVATION * activations[layer].abs().max())
             found.append((layer, _look(activations[layer], labels, true[layer], bound)))

@@ -18,7 +18,7 @@ from qsgm.blocks import single_layers
 from qsgm.errors import QsgmError
 from qsgm.network import ONE, Network, Pair
 from qsgm.progress import Progress
-from qsgm.schedule import BATCH, MOMENTUM, rate_factor
+from qsgm.schedule import BATCH, rate_factor
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm, float_product, float_trace
 from qsgm.task import Lesson, label_span
 from qsgm.train.checkpoint import Checkpoint
@@ -268,7 +268,6 @@ def step(
         moment.labels,
         rates,
         gradient_of,
-        MOMENTUM,
         trainee.checkpoint.curvatures,
     )
 

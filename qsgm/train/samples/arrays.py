@@ -7,7 +7,6 @@
 group: a person, a machine, a day; that is what a device meets.
 """
 
-import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.files import read_file
+from qsgm.files import read_file, sha256
 from qsgm.network import Network
 from qsgm.samples.arrays import GROUPS, LABELS, NAME, SAMPLES, ArraysTask, read_npz, samples_in
 from qsgm.samples.lesson import Samples
@@ -66,7 +65,7 @@ def load_arrays_task(path: Path) -> PooledArrays:
     if found.labels is None:
         raise QsgmError(f"{pool} holds no `{LABELS}`, without which nothing can be learnt")
     groups = _rows_of(arrays.get(GROUPS), len(found), pool)
-    digest = hashlib.sha256(found.inputs.tobytes() + found.labels.tobytes()).hexdigest()
+    digest = sha256(found.inputs.tobytes() + found.labels.tobytes())
     return PooledArrays(NAME, network, heads, tuned, found.inputs, found.labels, groups, digest)
 
 
