@@ -10,7 +10,7 @@ from qsgm.grasp.network import GRASPNET
 from qsgm.grasp.task import GraspTask
 from qsgm.train.grasp.decision import DecisionConfig, JudgedScene, Weighed, best_score, fit_decision
 from qsgm.train.grasp.decision_scenes import heatmap_of
-from qsgm.train.grasp.episodes import USUAL, EpisodeMaker
+from qsgm.train.grasp.episodes import EpisodeMaker
 from qsgm.train.model.fold import folded_start
 from qsgm.train.model.net import ConvNet, as_seen
 from qsgm.train.pretraining.tasks import start_states
@@ -18,11 +18,11 @@ from qsgm.train.pretraining.tasks import start_states
 
 @pytest.fixture(scope="module")
 def maker() -> EpisodeMaker:
-    return EpisodeMaker(3, USUAL, tables=2, others=12)
+    return EpisodeMaker(3, tables=2, others=12)
 
 
 def test_an_episode_depends_on_its_number_and_seed_only(maker: EpisodeMaker) -> None:
-    one, again = maker.draw(5, 1), EpisodeMaker(3, USUAL, tables=2, others=12).draw(5, 1)
+    one, again = maker.draw(5, 1), EpisodeMaker(3, tables=2, others=12).draw(5, 1)
     other = maker.draw(6, 1)
     for scene, same in ((one.demonstration, again.demonstration), (one.scenes[0], again.scenes[0])):
         np.testing.assert_array_equal(scene.image, same.image)

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.angles import wrap_half_turn
+from qsgm.train.grasp.drawing.camera import FRAME_HW
 from qsgm.train.grasp.drawing.noise import Colour, blur, white_noise
 from qsgm.train.grasp.drawing.parts import Brush
 from qsgm.train.grasp.drawing.render import Light, Sprite, fitted, render
 from qsgm.train.grasp.drawing.shapes import ELONGATED
 from qsgm.train.grasp.drawing.tables import draw_table
 
-FRAME_HW = (480, 640)
 CENTER_PX = (320, 240)
 LONG_PX = 96.0
 LEAST_ELONGATION = 1.5

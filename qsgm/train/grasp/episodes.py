@@ -5,13 +5,14 @@ Here everything else changes: the table, the light, the distance, a slant, and w
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.crops import HALF_CROP_PX
+from qsgm.train.grasp.drawing.camera import CENTER_PX, FRAME_HW
 from qsgm.train.grasp.drawing.noise import mean_colour
 from qsgm.train.grasp.drawing.scenes import (
     DrawnObject,
@@ -24,36 +25,20 @@ from qsgm.train.grasp.drawing.scenes import (
 from qsgm.train.grasp.drawing.structures import STRUCTURE_KINDS
 from qsgm.train.grasp.drawing.tables import chosen_table, draw_table
 
-CENTER_PX = (320.0, 240.0)
-FRAME_HW = (480, 640)
-# A table takes half of a scene's time: each is used again and again.
-TABLES = 48
-OTHERS = 96
+__all__ = ["CENTER_PX", "Episode", "EpisodeMaker", "EpisodesConfig"]
+
 # An object keeps this much beyond its window from the border.
 _BORDER_PX = HALF_CROP_PX + 16
 _LARGEST_TILT_RAD = np.deg2rad(25)
 
+# How often what is wrong with a scene: mostly one thing at a time.
+_CROWDS = (0, 0, 0, 0, 1, 1, 2, 2, 3, 4)  # other things, one of these numbers of them
+_STRUCTURES = (0.7, 0.25, 0.05)  # of no edge, gap or sheet, one, two
+_OTHER_DISTANCE, _TILTED, _HIDDEN = 0.15, 0.15, 0.4
+_DIM, _BLURRED = 0.12, 0.1
+_ALIKE = 0.3  # that another thing has the taught one's colours
+
 Image = NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Difficulty:
-    """How often what is wrong with a scene; probabilities, but for the crowds."""
-
-    crowds: tuple[int, ...]  # how many other things there are, one of these numbers
-    structures: tuple[float, float, float]  # of no edge, gap or sheet, one, two
-    other_distance: float  # 0.8 to 1.25 times as large
-    tilt: float  # up to 25 degrees
-    hidden: float  # up to a third
-    dim: float
-    blurred: float
-    alike: float  # that another thing has the taught one's colours
-
-
-# As scenes come: mostly one thing at a time.
-USUAL = Difficulty(
-    (0, 0, 0, 0, 1, 1, 2, 2, 3, 4), (0.7, 0.25, 0.05), 0.15, 0.15, 0.4, 0.12, 0.1, 0.3
-)
 
 
 @dataclass(frozen=True)
@@ -72,21 +57,19 @@ class EpisodesConfig:
 
     episodes: int
     scenes: int = 8  # with the object, and as many without it
-    tables: int = TABLES
-    others: int = OTHERS  # that lie there
+    tables: int = 48  # one takes half of a scene's time: each is used again and again
+    others: int = 96  # that lie there
 
     def maker(self, seed: int) -> "EpisodeMaker":
         """What draws them."""
-        return EpisodeMaker(seed, USUAL, self.tables, self.others)
+        return EpisodeMaker(seed, self.tables, self.others)
 
 
 class EpisodeMaker:
     """Draws episodes from one seed; tables and other things are drawn once and used again."""
 
-    def __init__(
-        self, seed: int, difficulty: Difficulty = USUAL, tables: int = TABLES, others: int = OTHERS
-    ) -> None:
-        self.seed, self.difficulty = seed, difficulty
+    def __init__(self, seed: int, tables: int, others: int) -> None:
+        self.seed = seed
         self._tables = [_table((seed, 1, i)) for i in range(tables)]
         self._others = [draw_object(np.random.default_rng((seed, 2, i))) for i in range(others)]
 
@@ -109,15 +92,13 @@ class EpisodeMaker:
     def _scene(
         self, seed: int, taught: DrawnObject, shown: DrawnObject, *, taken_away: bool
     ) -> DrawnScene:
-        rng, how = np.random.default_rng(seed), self.difficulty
+        rng = np.random.default_rng(seed)
         center = tuple(float(rng.uniform(_BORDER_PX, side - _BORDER_PX)) for side in FRAME_HW[::-1])
-        crowd = how.crowds[rng.integers(len(how.crowds))]
+        crowd = _CROWDS[rng.integers(len(_CROWDS))]
         others = [self._another(rng, taught) for _ in range(crowd)]
-        structures = [
-            str(rng.choice(STRUCTURE_KINDS)) for _ in range(rng.choice(3, p=how.structures))
-        ]
-        far = rng.random() < how.other_distance
-        tilt = rng.uniform(0, _LARGEST_TILT_RAD) if rng.random() < how.tilt else 0.0
+        structures = [str(rng.choice(STRUCTURE_KINDS)) for _ in range(rng.choice(3, p=_STRUCTURES))]
+        far = rng.random() < _OTHER_DISTANCE
+        tilt = rng.uniform(0, _LARGEST_TILT_RAD) if rng.random() < _TILTED else 0.0
         view = View(
             float(rng.uniform(0.8, 1.25) if far else rng.uniform(0.95, 1.05)),
             float(tilt),
@@ -132,10 +113,10 @@ class EpisodeMaker:
             center_px=(center[0], center[1]),
             turn_rad=float(rng.uniform(-np.pi, np.pi)),
             view=view,
-            hidden_share=0.33 if rng.random() < how.hidden else 0.05,
+            hidden_share=0.33 if rng.random() < _HIDDEN else 0.05,
             taken_away=taken_away,
         )
-        return _as_photographed(scene, rng, how)
+        return _as_photographed(scene, rng)
 
     def _table(self, rng: np.random.Generator) -> Image:
         """One of the tables, in one of its eight mirrored and turned ways, in other colours."""
@@ -150,20 +131,19 @@ class EpisodeMaker:
         while True:
             other = self._others[rng.integers(len(self._others))]
             if other.kind != taught.kind:
-                alike = rng.random() < self.difficulty.alike
+                alike = rng.random() < _ALIKE
                 return in_colours_of(other, taught) if alike else other
 
 
-def _as_photographed(scene: DrawnScene, rng: np.random.Generator, how: Difficulty) -> DrawnScene:
+def _as_photographed(scene: DrawnScene, rng: np.random.Generator) -> DrawnScene:
     """The scene in half light now and then, or out of focus."""
     image = scene.image
-    if rng.random() < how.dim:
+    if rng.random() < _DIM:
         light = rng.uniform(0.4, 0.75) * rng.uniform(0.93, 1.07, 3)
         image = np.clip(image * light, 0, 255).astype(np.uint8)
-    if rng.random() < how.blurred:
+    if rng.random() < _BLURRED:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.8, 2.0)), dtype=np.uint8)
-    values = vars(scene) | {"image": image}
-    return DrawnScene(**values)
+    return replace(scene, image=image)
 
 
 def _table(seed: Sequence[int]) -> Image:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.angles import wrap_half_turn
-from qsgm.train.grasp.drawing.camera import FRAME_SHAPE, random_light, seen_by_camera
-from qsgm.train.grasp.drawing.noise import Colour, Field, blur, mean_colour
+from qsgm.train.grasp.drawing.camera import FRAME_HW, random_light, seen_by_camera
+from qsgm.train.grasp.drawing.noise import Colour, Field, blur, cast_shadow, mean_colour
 from qsgm.train.grasp.drawing.render import LEAST_CONTRAST, Light, Sprite, contrast, render
 from qsgm.train.grasp.drawing.shapes import (
     OBJECT_KINDS,
@@ -60,7 +60,7 @@ def draw_frame(
     """
     object_kind = chosen_object(rng, object_kind, elongated)
     table_kind = chosen_table(rng, table_kind)
-    table = draw_table(rng, table_kind, FRAME_SHAPE)
+    table = draw_table(rng, table_kind, FRAME_HW)
     light = random_light(rng)
     sprite = _random_sprite(rng, object_kind, mean_colour(table), light)
     # Pixels, not outlines, decide where the rectangle's centre is: it is moved there whole.
@@ -68,7 +68,7 @@ def draw_frame(
     corner = (round(320 - rect[0][0]), round(240 - rect[0][1]))
     image = _composed(rng, table, sprite, corner, light)
     image = seen_by_camera(rng, image, light)
-    mask = np.zeros(FRAME_SHAPE, np.bool_)
+    mask = np.zeros(FRAME_HW, np.bool_)
     side = len(sprite.coverage)
     mask[corner[1] : corner[1] + side, corner[0] : corner[0] + side] = sprite.coverage >= 0.5
     long_side, short_side = max(rect[1]), min(rect[1])
@@ -135,9 +135,6 @@ def _shadow(rng: np.random.Generator, covered: Field, light: Light) -> Field:
     contact = blur(covered, rng.uniform(1.0, 3.0)) * np.float32(rng.uniform(0, 0.6))
     height = rng.uniform(1, 12)  # px; of the object above the table
     away = -height / light.z * np.array([light.x, light.y])
-    cast = np.zeros_like(covered)
-    for share in (0.35, 0.7, 1.0):  # an upright side throws a shadow all the way to the foot
-        matrix = np.array([[1, 0, away[0] * share], [0, 1, away[1] * share]], np.float64)
-        cast = np.maximum(cast, np.asarray(cv2.warpAffine(covered, matrix, (_PATCH, _PATCH))))
-    cast = blur(cast.astype(np.float32), rng.uniform(0.8, 7.0)) * np.float32(rng.uniform(0, 0.75))
+    cast = blur(cast_shadow(covered, away), rng.uniform(0.8, 7.0))
+    cast = cast * np.float32(rng.uniform(0, 0.75))
     return np.asarray((1 - contact) * (1 - cast), dtype=np.float32)

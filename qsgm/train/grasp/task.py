@@ -14,10 +14,9 @@ from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask
 from qsgm.task import Array
 from qsgm.train.grasp.draw_distractors import SHEET_SEED, distractor_file
+from qsgm.train.grasp.drawing.camera import CENTER_PX, FRAME_HW
 from qsgm.train.grasp.objects import draw_frame
 
-CENTER_PX = (320.0, 240.0)
-FRAME_HW = (480, 640)
 # Rounder than this, a drawn object has no axis worth learning: both angle labels are 0.
 LEAST_ELONGATION = 1.25
 

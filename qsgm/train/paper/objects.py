@@ -15,8 +15,8 @@ from torch import Tensor
 
 from qsgm.grasp.crops import cut_crops, label_crops, plan_crops
 from qsgm.grasp.task import GraspTask
+from qsgm.train.grasp.drawing.camera import CENTER_PX, FRAME_HW
 from qsgm.train.grasp.objects import DrawnFrame, draw_frame
-from qsgm.train.grasp.task import CENTER_PX, FRAME_HW
 
 # The paper's label: sine and cosine of an angle in (-90, 90] degrees, not smoothed.
 PAPER_TASK = GraspTask(encoding="paper", label_smoothing=0.0)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Field = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Shape = tuple[int, int]
+_BYTE_DEVIATION = 73.9  # of a uniform byte
 
 
 def white_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Field:
@@ -22,7 +23,7 @@ def white_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Field:
     Drawn as bytes because a normal value for each pixel would take longer than all the rest.
     """
     raw = np.frombuffer(rng.bytes(int(np.prod(shape))), dtype=np.uint8).reshape(shape)
-    return ((raw.astype(np.float32) - 127.5) * (1 / 73.9)).astype(np.float32)
+    return ((raw.astype(np.float32) - 127.5) * (1 / _BYTE_DEVIATION)).astype(np.float32)
 
 
 def smooth_noise(
@@ -66,6 +67,30 @@ def cloud_noise(
 def blur(field: Field, sigma: float) -> Field:
     """Gaussian blur with deviation ``sigma`` [px]."""
     return np.asarray(cv2.GaussianBlur(field, (0, 0), sigma), dtype=np.float32)
+
+
+def grainy(rng: np.random.Generator, image: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
+    """An image with a sensor's grain, whose strength [levels] is ``mean`` on average."""
+    grain = np.frombuffer(rng.bytes(image.size), np.uint8).reshape(image.shape)
+    share = rng.exponential(mean) / _BYTE_DEVIATION
+    return np.asarray(cv2.addWeighted(image, 1.0, grain, share, -127.5 * share), np.uint8)
+
+
+def dim(image: NDArray[np.uint8], light: Field) -> None:
+    """Multiplies each pixel of an image (H, W, 3) by a factor (H, W), in place."""
+    cv2.multiply(image, cv2.merge([light, light, light]), image, dtype=cv2.CV_8U)
+
+
+def cast_shadow(covered: Field, away: NDArray[np.float64]) -> Field:
+    """What (H, W) the shadow of a covered area falls on; its tip lies ``away`` (x, y) [px].
+
+    An upright side throws a shadow all the way to the foot.
+    """
+    size, cast = covered.shape[::-1], np.zeros_like(covered)
+    for share in (0.35, 0.7, 1.0):
+        matrix = np.array([[1, 0, away[0] * share], [0, 1, away[1] * share]], np.float64)
+        cast = np.maximum(cast, np.asarray(cv2.warpAffine(covered, matrix, size)))
+    return np.asarray(cast, np.float32)
 
 
 def paint(field: Field, stops: Sequence[Colour]) -> NDArray[np.uint8]:

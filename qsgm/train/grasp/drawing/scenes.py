@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from qsgm.train.grasp.drawing.camera import FRAME_SHAPE, random_light, seen_by_camera
-from qsgm.train.grasp.drawing.noise import Colour, Field, blur, hsv, mean_colour
+from qsgm.train.grasp.drawing.camera import FRAME_HW, random_light, seen_by_camera
+from qsgm.train.grasp.drawing.noise import Colour, Field, blur, cast_shadow, hsv, mean_colour
 from qsgm.train.grasp.drawing.render import (
     LEAST_CONTRAST,
     SUPERSAMPLING,
@@ -238,7 +238,7 @@ def _put_all(
     Returns whose each pixel (480, 640) is, 1 the object's and 2 another's, and how many the
     object would have if nothing hid it.
     """
-    owner = np.zeros(FRAME_SHAPE, np.uint8)
+    owner = np.zeros(FRAME_HW, np.uint8)
     heights = rng.uniform(1, 12, 1 + len(things))  # px; above the table
     whole = 0
     if target is not None:
@@ -287,7 +287,7 @@ def _shows(painted: Painted, table: Colour) -> bool:
 def _ground(rng: np.random.Generator, drawn: DrawnObject | None, kind: str | None) -> Image:
     """A table on which the object shows, unless none of a few does."""
     for _ in range(TRIES):
-        table = draw_table(rng, chosen_table(rng, kind), FRAME_SHAPE)
+        table = draw_table(rng, chosen_table(rng, kind), FRAME_HW)
         if drawn is None or _shows(drawn.painted, mean_colour(table)):
             break
     return table
@@ -345,7 +345,7 @@ def _placed(
         thing = _cutout(other, view, rng.uniform(0, 2 * np.pi), (0.0, 0.0), light)
         draw, direction = rng.random(), rng.uniform(0, 2 * np.pi)
         gap = rng.uniform(0, _NEAR_PX)
-        spot = rng.uniform(0, 1, 2) * FRAME_SHAPE[::-1]
+        spot = rng.uniform(0, 1, 2) * FRAME_HW[::-1]
         allowed = hidden_share if index == 0 else 0.0
         ahead = np.array([np.cos(direction), np.sin(direction)])
         if draw < _TOUCHING_SHARE + _NEAR_SHARE or allowed > 0:
@@ -399,7 +399,7 @@ def _window(
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """What of an array at a corner (x, y) lies in the frame: slices of the frame, of the array."""
     inside, own = [], []
-    for start, length, limit in zip(corner[::-1], shape[:2], FRAME_SHAPE, strict=True):
+    for start, length, limit in zip(corner[::-1], shape[:2], FRAME_HW, strict=True):
         low, high = max(start, 0), min(start + length, limit)
         high = max(high, low)
         inside.append(slice(low, high))
@@ -446,10 +446,7 @@ def _shadow(opacity: Image, shade: _Shade, height: float) -> Image:
     covered *= np.float32(1 / 255)
     contact = blur(covered, shade.contact_px / 2) * np.float32(shade.contact)
     away = -height / 2 / shade.light.z * np.array([shade.light.x, shade.light.y])
-    cast = covered
-    for share in (0.35, 0.7, 1.0):  # an upright side throws a shadow all the way to the foot
-        matrix = np.array([[1, 0, away[0] * share], [0, 1, away[1] * share]], np.float64)
-        cast = np.maximum(cast, np.asarray(cv2.warpAffine(covered, matrix, small)))
-    cast = blur(np.asarray(cast, np.float32), shade.cast_px / 2) * np.float32(shade.cast)
+    cast = np.maximum(covered, cast_shadow(covered, away))
+    cast = blur(cast, shade.cast_px / 2) * np.float32(shade.cast)
     left: Field = (1 - contact) * (1 - cast) * np.float32(255)
     return np.asarray(cv2.resize(left.astype(np.uint8), size), np.uint8)

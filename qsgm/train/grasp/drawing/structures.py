@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.train.grasp.drawing.noise import blur, chance, hsv, mean_colour, smooth_noise
+from qsgm.train.grasp.drawing.noise import (
+    blur,
+    chance,
+    dim,
+    grainy,
+    hsv,
+    mean_colour,
+    smooth_noise,
+)
 
 STRUCTURE_KINDS: tuple[str, ...] = ("edge", "gap", "sheet")
 
@@ -78,16 +86,16 @@ def _draw_floor(rng: np.random.Generator, image: Image, mask: NDArray[np.float32
         small = np.asarray(cv2.resize(1 - mask, None, fx=0.25, fy=0.25), np.float32)
         under = blur(small, rng.uniform(1, 6))
         shade = 1 - np.float32(rng.uniform(0.2, 0.8)) * under
-        _dim(floor, np.asarray(cv2.resize(shade, image.shape[1::-1]), np.float32))
+        dim(floor, np.asarray(cv2.resize(shade, image.shape[1::-1]), np.float32))
     _cover(image, floor, mask)
     if chance(rng, 0.5):  # the edge's own side, in shadow or catching the light
         border = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-        _dim(image, 1 + np.float32(rng.uniform(-0.7, 0.3)) * np.asarray(border, np.float32))
+        dim(image, 1 + np.float32(rng.uniform(-0.7, 0.3)) * np.asarray(border, np.float32))
 
 
 def _draw_gap(rng: np.random.Generator, image: Image, mask: NDArray[np.float32]) -> None:
     """A gap between two boards or tables, mostly dark."""
-    _dim(image, 1 - np.float32(rng.uniform(0.5, 0.95)) * mask)
+    dim(image, 1 - np.float32(rng.uniform(0.5, 0.95)) * mask)
 
 
 def _draw_sheet(rng: np.random.Generator, image: Image) -> None:
@@ -104,7 +112,7 @@ def _draw_sheet(rng: np.random.Generator, image: Image) -> None:
     fall = rng.uniform(-3, 3, 2)
     move = np.array([[1, 0, fall[0]], [0, 1, fall[1]]])
     cast = np.asarray(cv2.warpAffine(mask, move, (width, height)), np.float32)
-    _dim(image, 1 - np.float32(rng.uniform(0, 0.6)) * blur(cast, 1.5))
+    dim(image, 1 - np.float32(rng.uniform(0, 0.6)) * blur(cast, 1.5))
     _cover(image, _surface(rng, image), mask)
 
 
@@ -121,16 +129,9 @@ def _surface(rng: np.random.Generator, image: Image) -> Image:
     shade = 1 + np.float32(rng.uniform(0, 0.12)) * shade
     plain = np.empty_like(image)
     plain[:] = np.clip(colour, 0, 255)
-    grain = np.frombuffer(rng.bytes(image.size), np.uint8).reshape(image.shape)
-    share = rng.exponential(4.0) / 73.9  # 73.9 is the deviation of a uniform byte
-    _dim(plain, shade)
-    return np.asarray(cv2.addWeighted(plain, 1.0, grain, share, -127.5 * share), np.uint8)
+    dim(plain, shade)
+    return grainy(rng, plain, 4.0)
 
 
 def _cover(image: Image, surface: Image, mask: NDArray[np.float32]) -> None:
     image[:] = cv2.blendLinear(image, surface, 1 - mask, mask)
-
-
-def _dim(image: Image, light: NDArray[np.float32]) -> None:
-    """Multiplies each pixel by a factor (H, W)."""
-    cv2.multiply(image, cv2.merge([light, light, light]), image, dtype=cv2.CV_8U)

@@ -17,6 +17,7 @@ from qsgm.train.grasp.drawing.noise import (
     blur,
     chance,
     cloud_noise,
+    dim,
     drawn_from,
     hsv,
     mixed,
@@ -179,10 +180,9 @@ def _planks(rng: np.random.Generator, shape: Shape) -> Image:
 
 
 def _darkened(image: Image, amount: Field) -> Image:
-    """The image with each pixel dimmed by ``amount`` (0 to 1)."""
-    keep = np.clip(1 - amount, 0, 1).astype(np.float32)
-    product = cv2.multiply(image, cv2.merge([keep, keep, keep]), dtype=cv2.CV_8U)
-    return np.asarray(product, dtype=np.uint8)
+    """The image, each of its pixels dimmed by ``amount`` (0 to 1)."""
+    dim(image, np.clip(1 - amount, 0, 1).astype(np.float32))
+    return image
 
 
 def _veneer(rng: np.random.Generator, shape: Shape) -> Image:
