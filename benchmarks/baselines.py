@@ -27,7 +27,7 @@ from qsgm.grasp.lesson import GraspLesson
 from qsgm.grasp.source import crop_source
 from qsgm.grasp.task import GraspTask, grasp_task
 from qsgm.grasp.teach import as_demonstrations
-from qsgm.schedule import short_run_factor, steps_per_epoch
+from qsgm.schedule import gain_over, short_run, steps_per_epoch
 from qsgm.tables import number, table
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.model.fold import folded_start
@@ -117,7 +117,8 @@ def compare(checkpoint: Checkpoint, tasks: TaskSet, tuned: int, epochs: int) -> 
 
 def as_shipped(checkpoint: Checkpoint, tasks: TaskSet, tuned: int, epochs: int) -> Score:
     """The checkpoint's rule with all it has learnt."""
-    factor = short_run_factor(checkpoint.short_gain, epochs * steps_per_epoch(TRAIN_CROPS))
+    gains = short_run(checkpoint.short_gain)
+    factor = gain_over(gains, epochs * steps_per_epoch(TRAIN_CROPS))
     layers = checkpoint.net.network.last(tuned)
     rates = tuple(factor * rate for rate in checkpoint.rates[str(single_layers(layers))])
     rule = UpdateRule(checkpoint.sgms, checkpoint.curvatures, rates, grasping(checkpoint))

@@ -14,11 +14,9 @@ from qsgm.errors import QsgmError
 from qsgm.files import read_file, read_whole, sha256
 from qsgm.manifest import (
     COMMAND,
-    FORMAT,
     MANIFEST,
     MANIFEST_BYTES,
     NETWORK,
-    VERSION,
     WEIGHTS,
     Manifest,
     Method,
@@ -26,8 +24,7 @@ from qsgm.manifest import (
     Place,
     Recipe,
     default_blocks,
-    manifest_from,
-    parse_description,
+    parse_manifest,
 )
 from qsgm.network import Network
 from qsgm.runtime import open_session
@@ -193,7 +190,7 @@ def load_bundle(folder: Path) -> Bundle:
 def _load_bundle(folder: Path) -> Bundle:
     path = folder / MANIFEST
     data = read_file(path, MANIFEST_BYTES, f"a bundle written by `{COMMAND}`")
-    manifest = manifest_from(parse_description(data, path, FORMAT, (VERSION,), COMMAND), path)
+    manifest = parse_manifest(data, path)
     contents, left = {MANIFEST: data}, MOST_BYTES
     for name, expected in manifest.files.items():
         contents[name] = read_file(folder / name, left, f"a file that `{COMMAND}` wrote")

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_args
 from qsgm import defaults
 from qsgm.blocks import Blocks, one_block, parse_blocks, single_layers
 from qsgm.errors import QsgmError
-from qsgm.files import is_plain, read_file
+from qsgm.files import is_plain
 from qsgm.network import Network
 from qsgm.schedule import Gains, gain_over, short_run
 from qsgm.sgm.int8 import ACTIVATION_BITS, ActivationBits
@@ -28,8 +28,6 @@ NETWORK = "network.onnx"
 WEIGHTS = "weights.bin"
 FLOAT_BYTES = 4
 MANIFEST_BYTES = 4_000_000
-# Up to here a float64 tells whole numbers apart.
-LARGEST_WHOLE = 2**53
 COMMAND = "qsgm fold-and-quantize"
 
 Method = Literal["sgm", "bp"]
@@ -185,20 +183,17 @@ class Manifest:
         return json.dumps(self.to_json(), indent=1, sort_keys=True) + "\n"
 
 
-def read_manifest(folder: Path) -> Manifest:
-    """Read a bundle's manifest and check everything it says.
-
-    Raises:
-        QsgmError: it is missing, not JSON, of another version, lacks something or says nonsense;
-            names the first key that is wrong.
-    """
-    path = folder / MANIFEST
-    data = read_file(path, MANIFEST_BYTES, f"a bundle written by `{COMMAND}`")
+def parse_manifest(data: bytes, path: Path) -> Manifest:
+    """A bundle's manifest from its file's bytes; see :func:`manifest_from`."""
     return manifest_from(parse_description(data, path, FORMAT, (VERSION,), COMMAND), path)
 
 
 def manifest_from(values: Mapping[str, Any], path: Path) -> Manifest:
-    """A manifest from its plain values; see :func:`read_manifest`. `path` is where it lies."""
+    """A manifest from its plain values, everything in it checked. `path` is where it lies.
+
+    Raises:
+        QsgmError: it lacks something or says nonsense; names the first key that is wrong.
+    """
     read = _Reader(values, path)
     name, settings = read.part("task", "a name", _task_from)
     network = read.part("network", "layers that fit each other", Network.from_json)
@@ -292,32 +287,6 @@ def parse_description(
             f"{path} is of format {got}, expected {(kind, versions[-1])}; make it with `{command}`"
         )
     return dict(values)
-
-
-def require_keys(
-    path: Path, values: Mapping[str, Any], keys: Mapping[str, type], command: str
-) -> None:
-    """Refuse a description that lacks a key, or has a value of another type under it.
-
-    Raises:
-        QsgmError: names the first such key.
-    """
-    for key, kind in keys.items():
-        value = values.get(key)
-        if not _is_of(value, kind):
-            got = "nothing" if key not in values else type(value).__name__
-            raise QsgmError(
-                f"{path}: {key!r} holds {got}, expected {kind.__name__}; make it with `{command}`"
-            )
-
-
-def _is_of(value: object, kind: type) -> bool:
-    """Whether JSON's value is of a kind; it may write a float as a whole number."""
-    if isinstance(value, bool):
-        return False
-    if kind is float and isinstance(value, int):
-        return abs(value) <= LARGEST_WHOLE
-    return isinstance(value, kind)
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,6 @@ def gain_over(gains: Gains, steps: int) -> float:
     return gains[-1][1]
 
 
-def short_run_factor(gain: float, steps: int) -> float:
-    """:func:`gain_over` of :func:`short_run`."""
-    return gain_over(short_run(gain), steps)
-
-
 def rate_factor(step: int, steps: int) -> float:
     """Linear decay of all rates, from 1 at step 0 to 0 at step `steps`.
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from qsgm import QsgmError
-from qsgm.bundle import Bundle
+from qsgm.bundle import Bundle, load_bundle
 from qsgm.manifest import (
     MANIFEST,
     Manifest,
@@ -22,7 +22,6 @@ from qsgm.manifest import (
     Recipes,
     SgmEntry,
     manifest_from,
-    read_manifest,
 )
 from qsgm.network import Network
 
@@ -76,7 +75,7 @@ def test_usual_blocks_are_some_of_those_that_can_be_tuned(
 def test_a_manifest_comes_back_from_what_it_writes(
     bundle_folder: Path, written: dict[str, Any]
 ) -> None:
-    manifest = read_manifest(bundle_folder)
+    manifest = load_bundle(bundle_folder).manifest
     assert manifest.to_json() == written
     assert manifest.text() == (bundle_folder / MANIFEST).read_text()
     again = manifest_from(json.loads(manifest.text()), bundle_folder / MANIFEST)

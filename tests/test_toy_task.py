@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from toy_task import ToyLesson, ToyTask
 
 from qsgm import Bundle, Settings, load_bundle, prepare, resolve
-from qsgm.manifest import PRECISIONS, Precision, read_manifest
+from qsgm.manifest import PRECISIONS, Precision
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
 from qsgm.train.export import ExportOptions, export_bundle
 from qsgm.train.model.fold import fold_net, run_folded
@@ -96,7 +96,7 @@ def test_a_checkpoint_names_its_task_and_network(checkpoint: Path) -> None:
 
 
 def test_a_manifest_says_what_it_was_given(bundle: Bundle) -> None:
-    again = read_manifest(bundle.folder)
+    again = load_bundle(bundle.folder).manifest
     assert again.to_json() == bundle.manifest.to_json()
     assert again.network == TASK.network
     assert again.blocks[:4] == ("4", "3,4", "2,3,4", "1,2,3,4")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError, as_text
-from qsgm.files import read_file, read_whole, sha256
+from qsgm.files import read_whole, sha256
 from qsgm.grasp.angles import ENCODINGS, AngleEncoding
 from qsgm.grasp.candidates import candidate_cells
 from qsgm.grasp.decision import FALSE_ALARM_RATE, Decision
@@ -30,13 +30,14 @@ from qsgm.grasp.others import Other
 from qsgm.grasp.patch import PATCH_PX, Patch, decode_patch, encode_patch
 from qsgm.grasp.shown import View
 from qsgm.images import MAX_SIDE_PX, check_frame
-from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
+from qsgm.manifest import NETWORK
 from qsgm.runtime import Value, check_interface, open_session, run_options, running
 from qsgm.tuned_folder import (
     COMMAND,
     DESCRIPTION,
-    FORMAT,
     VERSION,
+    read_description,
+    require_keys,
     unaltered,
     write_tuned,
 )
@@ -345,15 +346,14 @@ def read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
 
 def _read_object(folder: Path) -> tuple[ObjectDescription, bytes]:
     path = folder / DESCRIPTION
-    data = read_file(path, MANIFEST_BYTES, f"an object written by `{COMMAND}`")
-    manifest = parse_description(data, path, FORMAT, VERSIONS, COMMAND)
+    manifest = read_description(folder, VERSIONS, f"an object written by `{COMMAND}`")
     if "task" in manifest:
         raise QsgmError(
             f"{folder} is a tuned network of another task, no object to look for in a frame; pass "
             "`qsgm predict` its samples instead"
         )
     first = manifest["version"] == VERSIONS[0]
-    require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS), COMMAND)
+    require_keys(path, manifest, _KEYS | ({} if first else _NEW_KEYS))
     name, encoding, offset_rad = (manifest[key] for key in ("name", "encoding", "offset_rad"))
     if encoding not in ENCODINGS or not math.isfinite(offset_rad):
         raise QsgmError(

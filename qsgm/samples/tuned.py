@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError, as_text
 from qsgm.files import read_file, read_whole
-from qsgm.manifest import MANIFEST_BYTES, NETWORK, parse_description, require_keys
+from qsgm.manifest import MANIFEST_BYTES, NETWORK
 from qsgm.network import Network
 from qsgm.runtime import Value, check_interface, open_session, running
 from qsgm.samples.lesson import Samples, checked_samples
 from qsgm.task import Array, Inputs, TaskRecord, heads_from_json, heads_to_json, output_count
-from qsgm.tuned_folder import COMMAND, DESCRIPTION, FORMAT, VERSION, unaltered, write_tuned
+from qsgm.tuned_folder import (
+    DESCRIPTION,
+    VERSION,
+    read_description,
+    require_keys,
+    unaltered,
+    write_tuned,
+)
 
 MOST_BYTES = 256_000_000
 _ADVICE = "tune it again with `qsgm finetune`"
@@ -110,12 +117,11 @@ def read_network(folder: Path) -> tuple[NetworkDescription, bytes]:
 
 def _read(folder: Path) -> tuple[NetworkDescription, bytes]:
     path = folder / DESCRIPTION
-    data = read_file(path, MANIFEST_BYTES, "a tuned network")
-    values = parse_description(data, path, FORMAT, (VERSION,), COMMAND)
+    values = read_description(folder, (VERSION,), "a tuned network")
     keys = {"name": str, "task": dict, "network": dict, "heads": list, "sha256": str}
-    require_keys(path, values, keys, COMMAND)
+    require_keys(path, values, keys)
     settings = dict(values["task"])
-    require_keys(path, settings, {"name": str}, COMMAND)
+    require_keys(path, settings, {"name": str})
     try:
         network, heads = Network.from_json(values["network"]), heads_from_json(values["heads"])
         if output_count(heads) != network.outputs:

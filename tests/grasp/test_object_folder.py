@@ -13,7 +13,6 @@ from toys import by_correlation
 
 from qsgm import QsgmError, load_object, tuned_folder
 from qsgm.bundle import Bundle
-from qsgm.grasp import tuned as tuned_module
 from qsgm.grasp.tuned import (
     MOST_VIEWS,
     ObjectDescription,
@@ -220,7 +219,7 @@ def test_an_object_that_is_replaced_while_it_is_read_is_the_old_or_the_new(
     bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, networks = tmp_path / "toy", [bundle.network_with({}), other_network(bundle)]
-    read, reads = tuned_module.read_file, 0
+    read, reads = tuned_folder.read_file, 0
 
     def replacing(path: Path, *arguments: Any) -> bytes:
         nonlocal reads
@@ -230,8 +229,7 @@ def test_an_object_that_is_replaced_while_it_is_read_is_the_old_or_the_new(
             save_object(folder, named("new"), networks[1], {})
         return data
 
-    for module in (tuned_module, tuned_folder):
-        monkeypatch.setattr(module, "read_file", replacing)
+    monkeypatch.setattr(tuned_folder, "read_file", replacing)
     for moment in range(1, 4):
         save_object(folder, named("old"), networks[0], {})
         reads = 0
