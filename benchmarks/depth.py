@@ -44,7 +44,7 @@ from qsgm.task import Head
 from qsgm.train.graphs.memory import live_peak, traced
 from qsgm.train.graphs.optimizers import Sgd
 from qsgm.train.graphs.step import step_model
-from qsgm.train.grouping import usual_blocks
+from qsgm.train.grouping import sgm_cost, usual_blocks
 from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.samples.drawn import HIDDEN, MOST_LATE
 from qsgm.tune.noop_step import noop_step
@@ -96,8 +96,11 @@ def measure(network: Network, repeats: int, threads: int) -> dict[str, Any]:
     """Every variant's step of all layers: milliseconds and bytes, and over backpropagation's."""
     net, sgms, layers = random_net(network), sgms_of(network), network.last(network.depth)
     int8 = {k: quantized(sgm, 16, HEADS) for k, sgm in sgms.items()}
-    shapes = {k: [conv.weight.shape for conv in sgm.convs] for k, sgm in sgms.items()}
-    groups = usual_blocks(network, network.depth, shapes, MOST_LATE)[network.depth]
+    costs = {
+        k: sgm_cost(network, k, [conv.weight.shape for conv in sgm.convs])
+        for k, sgm in sgms.items()
+    }
+    groups = usual_blocks(network, network.depth, costs, MOST_LATE)[network.depth]
     steps: dict[str, tuple[Blocks, Mapping[int, Any]]] = {
         "backprop": (one_block(layers), {}),
         "alone": (single_layers(layers), sgms),

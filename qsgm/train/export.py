@@ -54,7 +54,7 @@ from qsgm.train.graphs.trunk import (
     network_model,
     trunk_model,
 )
-from qsgm.train.grouping import cost_of_blocks, sgm_cost, usual_blocks
+from qsgm.train.grouping import SgmCost, cost_of_blocks, sgm_cost, usual_blocks
 from qsgm.train.heads import activate
 from qsgm.train.model.arrays import FLAT_ARRAYS, CurvatureArrays, FoldedNet
 from qsgm.train.model.fold import net_fold_error, run_folded, run_folded_sgm, sgm_fold_error
@@ -156,18 +156,24 @@ def export_bundle(
 
 def paying_groups(trainee: Trainee) -> dict[int, Blocks]:
     """By how many layers are tuned, the groups in which SGMs pay."""
-    checkpoint, late = trainee.checkpoint, meta_trained(trainee.checkpoint)
-    shapes = {k: [conv.weight.shape for conv in sgm.convs] for k, sgm in trainee.sgms.items()}
-    return usual_blocks(trainee.network, checkpoint.most_layers, shapes, late)
+    checkpoint, sgms = trainee.checkpoint, sgm_costs(trainee)
+    late = meta_trained(checkpoint)
+    return usual_blocks(trainee.network, checkpoint.most_layers, sgms, late)
+
+
+def sgm_costs(trainee: Trainee) -> dict[int, SgmCost]:
+    """What every SGM costs, by layer."""
+    return {
+        k: sgm_cost(trainee.network, k, [conv.weight.shape for conv in sgm.convs])
+        for k, sgm in trainee.sgms.items()
+    }
 
 
 def group_rows(
     trainee: Trainee, usual: Mapping[int, Blocks], manifest: Manifest
 ) -> Iterator[GroupRow]:
     """What the chosen groups cost beside each layer on its own and backpropagation."""
-    network = trainee.network
-    shapes = {k: [conv.weight.shape for conv in sgm.convs] for k, sgm in trainee.sgms.items()}
-    sgms = {k: sgm_cost(network, k, some) for k, some in shapes.items()}
+    network, sgms = trainee.network, sgm_costs(trainee)
     for blocks in usual.values():
         whole, singles = one_block(blocks.layers), single_layers(blocks.layers)
         every = (blocks, singles, whole)

@@ -100,17 +100,12 @@ def paying_blocks(
 
 
 def usual_blocks(
-    network: Network, most_layers: int, weights: Mapping[int, Iterable[tuple[int, ...]]], late: int
+    network: Network, most_layers: int, sgms: Mapping[int, SgmCost], late: int
 ) -> dict[int, Blocks]:
-    """By how many of the last layers are tuned, the groups that pay.
+    """By how many of the last layers are tuned, up to so many, the groups that pay.
 
-    Args:
-        network: whose layers they are.
-        most_layers: that can be tuned.
-        weights: shapes of the convolutions of the SGM behind each of them but the last.
-        late: see :func:`paying_blocks`.
+    Arguments are those of :func:`paying_blocks`.
     """
-    sgms = {layer: sgm_cost(network, layer, shapes) for layer, shapes in weights.items()}
     return {
         tuned: paying_blocks(network, network.last(tuned), sgms, min(late, tuned))
         for tuned in range(2, most_layers + 1)

@@ -18,6 +18,7 @@ from qsgm.train.pretraining.rates import (
     EARLY_RATE_GRID,
     SHORT_GAINS,
     RatesConfig,
+    Trials,
     choose_early,
     choose_late,
     choose_short_gain,
@@ -89,19 +90,17 @@ def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_their
     scores: list[Score] = []
     config = RatesConfig(epochs=1, early_epochs=1)
     start = folded_start(net, 6)
-    late, best = choose_late(
-        rule, start[3:], behind(GRASPNET, start[:3], pixels), config, scores.append
-    )
+    seen = behind(GRASPNET, start[:3], pixels)
+    late, best = choose_late(Trials(rule, start[3:], seen, config, scores.append))
     assert [len(late[tuned]) for tuned in (1, 2, 3)] == [1, 2, 3]
     assert len(scores) == len([*late_candidates(rule.rates)])
     lowest = min(score.objective for score in scores[-4:])
     assert lowest <= best.objective <= 1.01 * lowest
     short = RatesConfig(short_epochs=1)
     trial = UpdateRule(rule.sgms, FLAT, late[3], TASK)
-    seen = behind(GRASPNET, start[:3], pixels)
-    assert choose_short_gain(trial, start[3:], seen, short, scores.append) in SHORT_GAINS
+    assert choose_short_gain(Trials(trial, start[3:], seen, short, scores.append)) in SHORT_GAINS
     rule = UpdateRule(rule.sgms, FLAT, late[3], TASK)
-    early = choose_early(rule, start, pixels, config, scores.append)
+    early = choose_early(Trials(rule, start, pixels, config, scores.append))
     assert sorted(early) == [4, 5, 6]
     assert early[6][1:] == early[5]
     assert early[5][1:] == early[4]

@@ -15,7 +15,7 @@ from qsgm.train.pretraining import first_rates
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, run_sgms
 from qsgm.train.pretraining.first_rates import ALONE_GRID, candidates, choose_first, rate_alone
 from qsgm.train.pretraining.matching import MatchingConfig
-from qsgm.train.pretraining.rates import Rates, RatesConfig, Start
+from qsgm.train.pretraining.rates import Rates, RatesConfig, Start, Trials
 from qsgm.train.pretraining.tasks import TaskSet
 
 TASK = ToyTask()
@@ -70,13 +70,15 @@ def test_whole_runs_and_short_ones_count_alike(
 
     told: list[Score] = []
     monkeypatch.setattr(first_rates, "run_sgms", run)
-    assert choose_first(rule(), start, tasks, LENGTHS, told.append) == pytest.approx((1.5e-3, 3e-2))
+    found = choose_first(Trials(rule(), start, tasks, LENGTHS, told.append))
+    assert found == pytest.approx((1.5e-3, 3e-2))
     assert len(told) == len([*candidates(2)])
 
 
 def test_the_rates_chosen_are_those_that_do_best(start: Start, tasks: TaskSet) -> None:
-    found = choose_first(rule(), start, tasks, LENGTHS, lambda _: None)
-    assert found == choose_first(rule(), start, tasks, LENGTHS, lambda _: None)
+    trials = Trials(rule(), start, tasks, LENGTHS, lambda _: None)
+    found = choose_first(trials)
+    assert found == choose_first(trials)
 
     def worth(rates: Rates) -> float:
         runs = (LENGTHS.epochs, LENGTHS.short_epochs)

@@ -14,14 +14,13 @@ import torch
 from qsgm.task import Task
 from qsgm.train.pretraining.evaluate import (
     Score,
-    UpdateRule,
     best_rates,
     mean_score,
     run_sgms,
     score,
 )
 from qsgm.train.pretraining.matching import MatchingConfig, backprop_step
-from qsgm.train.pretraining.rates import RATE_GRID, AfterRun, Rates, RatesConfig, Start
+from qsgm.train.pretraining.rates import RATE_GRID, Rates, Start, Trials
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
 ALONE_GRID = (1e-3, 3e-3, 1e-2, 3e-2)
@@ -58,27 +57,18 @@ def rate_alone(
     return best_rates(scores)[0]
 
 
-def choose_first(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: AfterRun
-) -> Rates:
+def choose_first(trials: Trials) -> Rates:
     """The rates of all late layers with which SGMs that regressed gradients do best.
 
-    Args:
-        rule: these SGMs; its rates do not matter.
-        start: of the late layers.
-        tasks: as the first of them sees them.
-        config: lengths of a whole run and of a short one.
-        after_run: told about every pair of runs.
+    None are known: the rule's do not matter.
 
     Raises:
         QsgmError: runs diverge at all of them.
     """
-    some, scores = next(tasks.chunks(TASKS)), dict[Rates, Score]()
-    for rates in candidates(len(start)):
-        trial = replace(rule, rates=rates)
-        runs = [
-            run_sgms(trial, start, some, epochs) for epochs in (config.epochs, config.short_epochs)
-        ]
-        scores[rates] = mean_score(runs)
-        after_run(scores[rates])
+    some, scores, config = next(trials.tasks.chunks(TASKS)), dict[Rates, Score](), trials.config
+    for rates in candidates(len(trials.start)):
+        trial = replace(trials.rule, rates=rates)
+        lengths = (config.epochs, config.short_epochs)
+        scores[rates] = mean_score([run_sgms(trial, trials.start, some, n) for n in lengths])
+        trials.after_run(scores[rates])
     return best_rates(scores)

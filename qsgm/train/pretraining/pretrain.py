@@ -34,7 +34,7 @@ from qsgm.manifest import Recipe
 from qsgm.progress import Progress, counted
 from qsgm.task import Described, task_record
 from qsgm.train.checkpoint import Checkpoint, save_checkpoint
-from qsgm.train.grouping import usual_blocks
+from qsgm.train.grouping import sgm_cost, usual_blocks
 from qsgm.train.model.curvature import FLAT
 from qsgm.train.model.fold import convolutions, folded_start, write_back
 from qsgm.train.model.net import ConvNet
@@ -52,6 +52,7 @@ from qsgm.train.pretraining.rates import (
     AfterRun,
     RatesConfig,
     Start,
+    Trials,
     block_rates,
     choose_early,
     choose_grouped,
@@ -303,8 +304,8 @@ class _Stages:
         if isinstance(config.first_rates, tuple):
             return config.first_rates
         after_run = _scored(counted(self.watch, "first rates", len([*candidates(config.late)])))
-        rule = UpdateRule(sgms, FLAT, (), self.task)
-        return choose_first(rule, folded_start(net, config.late), tasks, config.rates, after_run)
+        rule, start = UpdateRule(sgms, FLAT, (), self.task), folded_start(net, config.late)
+        return choose_first(Trials(rule, start, tasks, config.rates, after_run))
 
     def _match_on(
         self, net: ConvNet, sgms: dict[int, Sgm], tasks: TaskSet, rates: tuple[float, ...]
@@ -387,8 +388,9 @@ class _Stages:
             count, samples = sizes.early_tasks, sizes.early_crops_per_task
             pixels = self._drawn(net, count, samples, 6, network.depth)
             whole = folded_start(net, network.depth)
-            rates |= choose_early(rule, whole, pixels, sizes, after_run)
-            grouped |= choose_grouped(rule, whole, pixels, sizes, groups, after_run)
+            trials = Trials(rule, whole, pixels, sizes, after_run)
+            rates |= choose_early(trials)
+            grouped |= choose_grouped(trials, groups)
         singles = {str(single_layers(network.last(k))): one for k, one in rates.items()}
         return singles | grouped, found
 
@@ -415,12 +417,12 @@ def _late_rates(
     rule: UpdateRule, start: Start, tasks: TaskSet, config: PretrainConfig, after_run: AfterRun
 ) -> LateRates:
     """Rates of the layers that were meta-trained, and of fewer."""
-    network, sizes = rule.task.network, config.rates
+    network = rule.task.network
     if not config.by_length:
-        rates, score = choose_late(rule, start, tasks, sizes, after_run)
-        rule = replace(rule, rates=rates[len(start)])
-        gain = choose_short_gain(rule, start, tasks, sizes, after_run)
-        return LateRates(rates, gain, {}, score)
+        trials = Trials(rule, start, tasks, config.rates, after_run)
+        rates, score = choose_late(trials)
+        whole = replace(rule, rates=rates[len(start)])
+        return LateRates(rates, choose_short_gain(replace(trials, rule=whole)), {}, score)
     recipes, score = choose_recipes(rule, start, tasks, after_run)
     rates = {
         tuned: next(one.rates for one in some if one.optimizer == "sgd")
@@ -433,8 +435,11 @@ def _late_rates(
 def _groups(rule: UpdateRule, late: int) -> list[Blocks]:
     """Groups of more layers than were meta-trained in which SGMs pay."""
     network = rule.task.network
-    shapes = {k: [(*c.weight.shape,) for c in convolutions(sgm)] for k, sgm in rule.sgms.items()}
-    usual = usual_blocks(network, network.depth, shapes, late)
+    costs = {
+        k: sgm_cost(network, k, [(*conv.weight.shape,) for conv in convolutions(sgm)])
+        for k, sgm in rule.sgms.items()
+    }
+    usual = usual_blocks(network, network.depth, costs, late)
     return [
         blocks
         for tuned, blocks in usual.items()

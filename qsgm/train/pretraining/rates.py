@@ -44,6 +44,23 @@ class RatesConfig:
     early_epochs: int = 15
 
 
+@dataclass(frozen=True)
+class Trials:
+    """Fine-tuning runs by which rates of the last layers are chosen."""
+
+    rule: UpdateRule  # how layers learn; its rates are those that are known beforehand
+    start: Start  # of as many layers
+    tasks: TaskSet  # as the first of these layers sees them
+    config: RatesConfig
+    after_run: AfterRun  # told about every run
+
+    def seen(self, tuned: int) -> tuple[Start, TaskSet]:
+        """Start and tasks of fewer layers."""
+        network, skipped = self.rule.task.network, len(self.start) - tuned
+        first = network.depth + 1 - len(self.start)
+        return self.start[skipped:], behind(network, self.start[:skipped], self.tasks, first)
+
+
 def block_rates(network: Network, meta_rates: Rates) -> dict[str, Rates]:
     """Rates by blocks: earlier layers as one block with the first meta-trained one.
 
@@ -64,104 +81,65 @@ def late_candidates(meta_rates: Rates) -> Iterator[Rates]:
     yield from (tuple(factor * rate for rate in meta_rates) for factor in META_RATE_FACTORS)
 
 
-def choose_late(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: AfterRun
-) -> tuple[dict[int, Rates], Score]:
+def choose_late(trials: Trials) -> tuple[dict[int, Rates], Score]:
     """The best rates for few layers, by their number, and the score of the most.
 
-    Args:
-        rule: how layers learn; its rates are the meta-trained ones.
-        start: of as many layers as there are meta-trained rates.
-        tasks: as the first of these layers sees them.
-        config: sizes.
-        after_run: told about every run.
+    Known are the meta-trained ones, of all layers that the trials start with.
     """
-    scores: dict[int, dict[Rates, Score]] = {}
+    rule, most, scores = trials.rule, len(trials.start), dict[int, dict[Rates, Score]]()
     for rates in late_candidates(rule.rates):
         tuned = len(rates)
-        skipped = len(start) - tuned
-        network = rule.task.network
-        seen = behind(network, start[:skipped], tasks, network.depth + 1 - len(start))
         # A layer alone has its gradient from the loss, and is trained as by backpropagation.
         trial = replace(rule, rates=rates, curvatures=rule.curvatures if tuned > 1 else FLAT)
-        score = run_sgms(trial, start[skipped:], seen, config.epochs)
+        score = run_sgms(trial, *trials.seen(tuned), trials.config.epochs)
         scores.setdefault(tuned, {})[rates] = score
-        after_run(score)
+        trials.after_run(score)
     best = {tuned: best_rates(of_tuned) for tuned, of_tuned in scores.items()}
-    return best, scores[len(start)][best[len(start)]]
+    return best, scores[most][best[most]]
 
 
-def choose_short_gain(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: RatesConfig, after_run: AfterRun
-) -> float:
+def choose_short_gain(trials: Trials) -> float:
     """What the rates of a whole run are best multiplied with in a short one."""
     scores: dict[Rates, Score] = {}
     for gain in SHORT_GAINS:
-        trial = replace(rule, rates=tuple(gain * rate for rate in rule.rates))
-        scores[(gain,)] = run_sgms(trial, start, tasks, config.short_epochs)
-        after_run(scores[(gain,)])
+        trial = replace(trials.rule, rates=tuple(gain * rate for rate in trials.rule.rates))
+        score = run_sgms(trial, trials.start, trials.tasks, trials.config.short_epochs)
+        scores[(gain,)] = score
+        trials.after_run(score)
     return best_rates(scores)[0]
 
 
-def choose_grouped(
-    rule: UpdateRule,
-    start: Start,
-    pixels: TaskSet,
-    config: RatesConfig,
-    every: Sequence[Blocks],
-    after_run: AfterRun,
-) -> dict[str, Rates]:
-    """The best rates for layers in groups: one for all in front of the meta-trained ones.
+def choose_grouped(trials: Trials, every: Sequence[Blocks]) -> dict[str, Rates]:
+    """The best rates for layers in groups: one for all in front of those that are known.
 
     Args:
-        rule: how layers learn; its rates are those of the meta-trained layers.
-        start: of all layers.
-        pixels: tasks as layer 1 sees them.
-        config: sizes.
-        every: groups of more layers than were meta-trained.
-        after_run: told about every run.
+        trials: of all layers.
+        every: groups of more layers than are known.
     """
     return {
-        str(blocks): _with_early(
-            replace(rule, blocks=blocks), len(blocks.layers), start, pixels, config, after_run
-        )
-        for blocks in every
+        str(one): _with_early(trials, replace(trials.rule, blocks=one), len(one.layers))
+        for one in every
     }
 
 
-def choose_early(
-    rule: UpdateRule, start: Start, pixels: TaskSet, config: RatesConfig, after_run: AfterRun
-) -> dict[int, Rates]:
+def choose_early(trials: Trials) -> dict[int, Rates]:
     """The best rates for many layers, one more at a time: those behind keep theirs.
 
-    Args:
-        rule: how layers learn; its rates are those of fewer layers than `start` has.
-        start: of all layers.
-        pixels: tasks as layer 1 sees them.
-        config: sizes.
-        after_run: told about every run.
+    Known are those of fewer layers than the trials start with, which are all.
     """
-    chosen = {}
-    for tuned in range(len(rule.rates) + 1, len(start) + 1):
-        chosen[tuned] = _with_early(rule, tuned, start, pixels, config, after_run)
+    rule, chosen = trials.rule, dict[int, Rates]()
+    for tuned in range(len(rule.rates) + 1, len(trials.start) + 1):
+        chosen[tuned] = _with_early(trials, rule, tuned)
         rule = replace(rule, rates=chosen[tuned])
     return chosen
 
 
-def _with_early(
-    rule: UpdateRule,
-    tuned: int,
-    start: Start,
-    pixels: TaskSet,
-    config: RatesConfig,
-    after_run: AfterRun,
-) -> Rates:
+def _with_early(trials: Trials, rule: UpdateRule, tuned: int) -> Rates:
     """The rule's rates, and in front of them the best one of a few, up to so many layers."""
-    skipped, scores = len(start) - tuned, dict[Rates, Score]()
-    seen = behind(rule.task.network, start[:skipped], pixels)
+    scores, (start, tasks) = dict[Rates, Score](), trials.seen(tuned)
     for rate in EARLY_RATE_GRID:
         rates = (rate,) * (tuned - len(rule.rates)) + rule.rates
         trial = replace(rule, rates=rates)
-        scores[rates] = run_sgms(trial, start[skipped:], seen, config.early_epochs, chunk=1)
-        after_run(scores[rates])
+        scores[rates] = run_sgms(trial, start, tasks, trials.config.early_epochs, chunk=1)
+        trials.after_run(scores[rates])
     return best_rates(scores)
