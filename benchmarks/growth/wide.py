@@ -19,7 +19,7 @@ from qsgm.task import Heads, label_span
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.sgm import sgm_gradient
 from qsgm.train.graphs.step import AnySgm
-from qsgm.train.model.arrays import CurvatureArrays, FoldedLayer, FoldedNet
+from qsgm.train.model.arrays import CurvatureArrays, FoldedNet
 from qsgm.train.quantization.trunk import QuantizedLayer, feature_steps, quantize_trunk
 from qsgm.train.quantization.trunk_ranges import observe_samples
 from qsgm.weights import to_step_layout
@@ -70,7 +70,7 @@ def random_net(network: Network) -> FoldedNet:
     return FoldedNet(
         network,
         tuple(
-            FoldedLayer(
+            FoldedConv(
                 random_weight(rng, layer.out, layer.into, layer.kernel),
                 np.zeros(layer.out, np.float32),
             )

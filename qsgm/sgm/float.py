@@ -16,9 +16,9 @@ Number = TypeVar("Number", np.uint8, np.float32)
 
 @dataclass(frozen=True)
 class FoldedConv:
-    """A convolution of an SGM, padded to keep the size."""
+    """A convolution of an SGM, padded to keep the size, or of a layer, with batchnorm in it."""
 
-    weight: FloatArray  # (O, I, k, k)
+    weight: FloatArray  # (O, I, kh, kw)
     bias: FloatArray  # (O,)
 
 

@@ -263,23 +263,30 @@ def dead_channels(seen: SgmRanges) -> tuple[tuple[int, ...], tuple[tuple[int, ..
 def quantize_product(
     weight: Float64Array, bias: Float64Array, bits: WeightBits = 16
 ) -> QuantizedProduct:
-    """Round weight (O, I) to so many bits with a symmetric scale per row, the bias to int32.
-
-    A bias far larger than its row would overflow: such a row gets a coarser scale. Its weights
-    lose precision that the bias drowns anyway.
-    """
+    """Round weight (O, I) to so many bits with a symmetric scale per row, the bias to int32."""
     # Weights are counted in steps of the fine plane; without one they are whole coarse steps. With
     # 127 more than 127 * 256 the coarse plane would overflow.
     step = 1 if bits == 16 else PLANE_STEPS
     top = PLANE_STEPS * (2 ** (min(bits, 8) - 1) - 1)
-    scale = np.maximum(np.abs(weight).max(axis=1) / top, np.abs(bias) / BIAS_LIMIT)
-    scale = np.maximum(scale, SMALLEST_SCALE).astype(np.float32)
+    scale = row_scales(weight, bias, top)
     exact = scale.astype(np.float64)
     whole = step * np.rint(weight / (step * exact[:, None]))
     coarse = np.floor((whole + HALF_PLANE) / PLANE_STEPS)
     fine = whole - PLANE_STEPS * coarse  # -128 to 127
     rounded_bias = np.rint(bias / exact).astype(np.int32)
     return QuantizedProduct(coarse.astype(np.int8), fine.astype(np.int8), scale, rounded_bias)
+
+
+def row_scales(weight: Float64Array, bias: Float64Array, top: int) -> FloatArray:
+    """What one step of each row of weights (O, ...) and of its bias (O,) stands for, (O,).
+
+    The largest weight is `top` steps. A bias far larger than its row would overflow: such a row
+    gets a coarser scale. Its weights lose precision that the bias drowns anyway.
+    """
+    largest = np.abs(weight).reshape(len(weight), -1).max(axis=1)
+    scale = np.maximum(largest / top, np.abs(bias) / BIAS_LIMIT)
+    large_enough: FloatArray = np.maximum(scale, SMALLEST_SCALE).astype(np.float32)
+    return large_enough
 
 
 def constants(q: QuantizedSgm) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,7 @@ from qsgm.blocks import Blocks
 from qsgm.network import InputKind, Layer, Network, Pair
 from qsgm.sgm.float import FoldedConv, FoldedSgm
 from qsgm.task import Head, Heads
-from qsgm.train.model.arrays import FoldedLayer, FoldedNet
+from qsgm.train.model.arrays import FoldedNet
 
 LARGEST = 9  # side of an input
 # Any network of two to four layers, and shallow and deep ones along one axis and two.
@@ -212,7 +212,7 @@ def cases(
     for layer in network.layers:
         weight = rng.normal(size=(layer.out, layer.into, *layer.kernel)) / np.sqrt(layer.window)
         bias = rng.normal(size=layer.out) / 3
-        folded.append(FoldedLayer(weight.astype(np.float32), bias.astype(np.float32)))
+        folded.append(FoldedConv(weight.astype(np.float32), bias.astype(np.float32)))
     return Case(FoldedNet(network, tuple(folded)), some, seed)
 
 

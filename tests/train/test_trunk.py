@@ -21,7 +21,7 @@ from qsgm.grasp.source import Demonstration, crop_source
 from qsgm.grasp.task import GraspTask
 from qsgm.network import Layer, Network, conv
 from qsgm.runtime import session_options
-from qsgm.sgm.float import FloatArray
+from qsgm.sgm.float import FloatArray, FoldedConv
 from qsgm.train.graphs.build import Graph
 from qsgm.train.graphs.inspection import (
     integer_operators,
@@ -35,7 +35,7 @@ from qsgm.train.graphs.trunk import int8_layer, int8_trunk_model, trunk_model
 from qsgm.train.grasp.calibration_set import CalibrationLessons, CalibrationSet
 from qsgm.train.grasp.draw_calibration import draw_calibration_set
 from qsgm.train.grasp.task import shipped_things
-from qsgm.train.model.arrays import FoldedLayer, FoldedNet
+from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.fold import fold_net, fold_sgm
 from qsgm.train.model.net import as_seen
 from qsgm.train.model.sgm import Sgm
@@ -170,7 +170,7 @@ def test_onnx_runtime_computes_an_int8_layer_bit_for_bit(
     out = (side - kernel) // stride + 1
     size = (*shape, kernel, kernel)
     weight = rng.normal(size=size) * np.exp(rng.normal(size=(shape[0], 1, 1, 1)))
-    folded = FoldedLayer(
+    folded = FoldedConv(
         weight.astype(np.float32), (bias * rng.normal(size=shape[0])).astype(np.float32)
     )
     side_after = 1 if pool else out

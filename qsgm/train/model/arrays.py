@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from qsgm.network import Network
-from qsgm.sgm.float import FloatArray
+from qsgm.sgm.float import FloatArray, FoldedConv
 
 # A pixel is seen as value / range - 1.
 PIXEL_RANGE = 127.5
@@ -19,19 +19,11 @@ PIXEL_OFFSET = -1.0
 
 
 @dataclass(frozen=True)
-class FoldedLayer:
-    """A layer's convolution."""
-
-    weight: FloatArray  # (Co, Ci, kh, kw)
-    bias: FloatArray  # (Co,)
-
-
-@dataclass(frozen=True)
 class FoldedNet:
     """All layers; the first takes pixels in [-1, 1]."""
 
     network: Network
-    layers: tuple[FoldedLayer, ...]
+    layers: tuple[FoldedConv, ...]
     # By layer, (Co,): what one step of each channel stands for where its output is kept in u8, see
     # :mod:`qsgm.train.quantization.trunk`. Features of a layer that is not here are float32.
     feature_steps: Mapping[int, FloatArray] = field(default_factory=dict)
@@ -61,5 +53,5 @@ def on_pixels(net: FoldedNet) -> FoldedNet:
     first = net.layers[0]
     weight = first.weight.astype(np.float64)
     bias = first.bias + PIXEL_OFFSET * weight.sum(axis=(1, 2, 3))
-    absorbed = FoldedLayer((weight * PIXEL_SCALE).astype(np.float32), bias.astype(np.float32))
+    absorbed = FoldedConv((weight * PIXEL_SCALE).astype(np.float32), bias.astype(np.float32))
     return replace(net, layers=(absorbed, *net.layers[1:]))

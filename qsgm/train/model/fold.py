@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from qsgm.errors import QsgmError
 from qsgm.sgm.float import FloatArray, FoldedConv, FoldedSgm
-from qsgm.train.model.arrays import FoldedLayer, FoldedNet
+from qsgm.train.model.arrays import FoldedNet
 from qsgm.train.model.net import ConvLayer, ConvNet, as_seen
 from qsgm.train.model.sgm import Sgm
 
@@ -32,12 +32,12 @@ def fold_net(net: ConvNet) -> FoldedNet:
     return FoldedNet(net.network, tuple(folded))
 
 
-def fold_layer(number: int, layer: ConvLayer) -> FoldedLayer:
+def fold_layer(number: int, layer: ConvLayer) -> FoldedConv:
     """One layer, numbered from 1."""
     weight, bias = as_float64(layer.conv)
     if layer.norm is not None:
         weight, bias = absorb_norm(weight, bias, layer.norm, f"layer {number}")
-    return FoldedLayer(*as_float32(f"layer {number}", weight, bias))
+    return FoldedConv(*as_float32(f"layer {number}", weight, bias))
 
 
 def fold_sgm(sgm: Sgm) -> FoldedSgm:

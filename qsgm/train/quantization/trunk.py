@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from qsgm.network import NONE, ONE, Network, area
 from qsgm.sgm.float import FloatArray
-from qsgm.sgm.int8 import BIAS_LIMIT, SMALLEST_SCALE, U8_MAX, live_span
+from qsgm.sgm.int8 import U8_MAX, live_span, row_scales
 from qsgm.train.model.arrays import PIXEL_OFFSET, PIXEL_SCALE, FoldedNet
 
 S8_MAX = 127
@@ -101,13 +101,8 @@ def has_int8_trunk(network: Network) -> bool:
 def round_rows(
     weight: NDArray[np.float64], bias: NDArray[np.float64]
 ) -> tuple[NDArray[np.int8], FloatArray, NDArray[np.int32]]:
-    """Weight (Co, Ci, kh, kw) in s8, the scale of each of its rows (Co,), bias (Co,) in int32.
-
-    A bias far larger than its row would overflow: such a row gets a coarser scale. Its weights
-    lose precision that the bias drowns anyway.
-    """
-    scale = np.maximum(np.abs(weight).max(axis=(1, 2, 3)) / S8_MAX, np.abs(bias) / BIAS_LIMIT)
-    scale = np.maximum(scale, SMALLEST_SCALE).astype(np.float32)
+    """Weight (Co, Ci, kh, kw) in s8, the scale of each of its rows (Co,), bias (Co,) in int32."""
+    scale = row_scales(weight, bias, S8_MAX)
     exact = scale.astype(np.float64)
     rounded = np.rint(weight / exact[:, None, None, None]).astype(np.int8)
     return rounded, scale, np.rint(bias / exact).astype(np.int32)
