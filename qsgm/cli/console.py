@@ -1,7 +1,7 @@
 """What the commands say: results to stdout, progress and complaints to stderr."""
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +11,15 @@ from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.progress import Progress as Bars
 
 from qsgm import paths
 from qsgm.errors import QsgmError, as_text
-from qsgm.progress import ignore
+from qsgm.progress import NO_FIGURES, Progress, ignore
 
 if TYPE_CHECKING:
     from qsgm.bundle import Bundle
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 # library: the extra that brings it
 HOST_LIBRARIES = {"torch": "train", "onnx": "train", "matplotlib": "report"}
 LEAST_COLUMNS, MOST_COLUMNS = 40, 1000
-# (stage, done, of how many, values to show)
-Watch = Callable[..., None]
 
 
 def tell(what: str, path: Path) -> None:
@@ -123,10 +121,10 @@ def host_module(name: str) -> Any:
 
 
 @contextmanager
-def progress() -> Iterator[Watch]:
+def progress() -> Iterator[Progress]:
     """A bar per stage on stderr, on a terminal only; yields what is told about progress."""
     console = terminal(stderr=True)
-    if not console.is_terminal:  # a `Progress` that is disabled ends with an empty line in rich 13
+    if not console.is_terminal:  # bars that are disabled end with an empty line in rich 13
         yield ignore
         return
     columns = (
@@ -137,12 +135,14 @@ def progress() -> Iterator[Watch]:
         TextColumn("{task.fields[values]}"),
     )
     tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Bars(*columns, console=console, transient=True) as bars:
 
-        def watch(stage: str, done: int, of: int, values: dict[str, float] | None = None) -> None:
+        def watch(
+            stage: str, done: int, of: int, figures: Mapping[str, float] = NO_FIGURES, /
+        ) -> None:
             if stage not in tasks:
-                tasks[stage] = progress.add_task(stage, total=of, values="")
-            shown = "  ".join(f"{name} {value:.4g}" for name, value in (values or {}).items())
-            progress.update(tasks[stage], completed=done, total=of, values=shown)
+                tasks[stage] = bars.add_task(stage, total=of, values="")
+            shown = "  ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            bars.update(tasks[stage], completed=done, total=of, values=shown)
 
         yield watch

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.errors import QsgmError
-from qsgm.grasp.crops import HALF_CROP_PX
+from qsgm.grasp.crops import HALF_CROP_PX, POSITIVE_JITTER_PX
 from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.pixels import ZERO, arithmetic
 
@@ -86,14 +86,7 @@ class PastePlan:
         return len(self.sprite)
 
     def __getitem__(self, rows: slice | NDArray[np.int64]) -> "PastePlan":
-        return PastePlan(
-            self.sprite[rows],
-            self.center_px[rows],
-            self.turn_rad[rows],
-            self.scale[rows],
-            self.gain[rows],
-            self.shadow[rows],
-        )
+        return PastePlan(*(values[rows] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -108,7 +101,7 @@ class EdgePlan:
         return len(self.color)
 
     def __getitem__(self, rows: slice | NDArray[np.int64]) -> "EdgePlan":
-        return EdgePlan(self.planes[rows], self.color[rows], self.grain[rows])
+        return EdgePlan(*(values[rows] for values in vars(self).values()))
 
 
 def load_distractors(data: bytes) -> Distractors:
@@ -139,13 +132,11 @@ def with_named(things: Distractors | None, sprites: NDArray[np.uint8]) -> Distra
     )
 
 
-def plan_pastes(
-    rng: np.random.Generator, count: int, sprites: int, spread_px: float = 4.0
-) -> PastePlan:
+def plan_pastes(rng: np.random.Generator, count: int, sprites: int) -> PastePlan:
     """Draw a plan of `count` things out of `sprites`, at the crop's middle or near it.
 
     Every turn, 0.8 to 1.2 times as large, in a little other light and with a soft shadow. The
-    middle is off by up to `spread_px` on each axis, as the object's own is in crops of it.
+    middle is off by up to 4 px on each axis, as the object's own is in crops of it.
     """
     size = (count, 1)
     brightness = rng.uniform(0.75, 1.2, size) * rng.uniform(0.9, 1.1, (count, 3))
@@ -155,9 +146,9 @@ def plan_pastes(
     strength = np.rint(rng.uniform(0, 0.6, size) * 255)
     return PastePlan(
         sprite=rng.integers(0, sprites, count).astype(np.int32),
-        center_px=(HALF_CROP_PX + rng.uniform(-spread_px, spread_px, (count, 2))).astype(
-            np.float32
-        ),
+        center_px=(
+            HALF_CROP_PX + rng.uniform(-POSITIVE_JITTER_PX, POSITIVE_JITTER_PX, (count, 2))
+        ).astype(np.float32),
         turn_rad=rng.uniform(-np.pi, np.pi, count).astype(np.float32),
         scale=rng.uniform(0.8, 1.2, count).astype(np.float32),
         gain=np.rint(brightness * UNIT_GAIN).astype(np.int32),

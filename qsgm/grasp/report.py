@@ -135,11 +135,15 @@ def instances_table(instances: Sequence[Detection], name: str) -> RenderableType
     for header in ("quality", "centre", "move right, down", "turn", "or the opposite"):
         table.add_column(header, justify="right")
     for one in instances:
-        (x, y), (right, down) = one.center_px, (value + 0.0 for value in one.displacement_px)
-        move = f"{right:+.1f}, {down:+.1f} px"
         both = "no" if one.full_angle_deg is not None else "yes"
-        table.add_row(f"{one.quality:.2f}", f"{x:.1f}, {y:.1f} px", move, turn_text(one), both)
+        table.add_row(f"{one.quality:.2f}", *place_texts(one), both)
     return table
+
+
+def place_texts(place: Detection) -> tuple[str, str, str]:
+    """Centre, move and turn in few words."""
+    (x, y), (right, down) = place.center_px, (value + 0.0 for value in place.displacement_px)
+    return f"{x:.1f}, {y:.1f} px", f"{right:+.1f}, {down:+.1f} px", turn_text(place)
 
 
 def turn_text(detection: Detection) -> str:

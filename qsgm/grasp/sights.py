@@ -21,8 +21,8 @@ from qsgm.grasp.report import (
     instances_table,
     object_json,
     place_json,
+    place_texts,
     predict_json,
-    turn_text,
 )
 from qsgm.grasp.tuned import TunedObject
 from qsgm.tables import number, table
@@ -185,9 +185,7 @@ def _rows(sight: Sight) -> list[tuple[object, ...]]:
         if not one.found:
             rows.append((sight.name, quality, "not found", None, None))
             continue
-        (x, y), (right, down) = one.center_px, (value + 0.0 for value in one.displacement_px)
-        turn = turn_text(one) + ("" if one.full_angle_deg is not None else " or opposite")
-        rows.append(
-            (sight.name, quality, f"{x:.1f}, {y:.1f} px", f"{right:+.1f}, {down:+.1f} px", turn)
-        )
+        *where, turn = place_texts(one)
+        opposite = "" if one.full_angle_deg is not None else " or opposite"
+        rows.append((sight.name, quality, *where, turn + opposite))
     return rows

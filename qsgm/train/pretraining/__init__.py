@@ -8,7 +8,6 @@ maml        stage 3: SGMs, start and rates through whole runs that the SGMs driv
 map_sgms    stage 4: SGMs behind the layers with maps
 rates       stage 5: the rates that runs of one to six layers start with
 recipes     stage 5 of tasks of samples: optimizer and rates by a run's length
-adam        Adam on the layers of many tasks
 evaluate    whole fine-tuning runs, and their scores
 resume      finished stages on disk, to go on with after an interruption
 pretrain    the stages in their order

@@ -1,6 +1,6 @@
 """Whole fine-tuning runs on many tasks in torch: which rates work, and how well."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
@@ -25,7 +25,6 @@ from qsgm.train.model.local import (
     outputs,
 )
 from qsgm.train.model.sgm import Sgm
-from qsgm.train.pretraining.adam import AdamMoments
 from qsgm.train.pretraining.maml import apply_sgm
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
@@ -54,6 +53,26 @@ class UpdateRule:
         if layer == self.task.network.depth:
             return error(self.task.heads, activation, labels[:, :, None])
         return apply_sgm(self.sgms[layer], activation, labels)
+
+
+class AdamMoments:
+    """Adam as torch and the device have it: number by number, so that no task knows of another."""
+
+    def __init__(self, states: Sequence[LayerState]) -> None:
+        self._states = [LayerState.start(one.weight.clone(), one.bias.clone()) for one in states]
+        groups = [{"params": [one.weight, one.bias], "lr": 0.0} for one in self._states]
+        self._adam = torch.optim.Adam(groups)
+
+    def step(
+        self, gradients: Iterable[tuple[Tensor, Tensor]], rates: Sequence[float]
+    ) -> list[LayerState]:
+        """The states after one more step, which are the same numbers' places every time."""
+        groups, found = self._adam.param_groups, [*gradients]
+        for state, given, group, rate in zip(self._states, found, groups, rates, strict=True):
+            state.weight.grad, state.bias.grad = given
+            group["lr"] = rate
+        self._adam.step()
+        return self._states
 
 
 @torch.no_grad()
