@@ -1,4 +1,4 @@
-"""The sheet of drawn things that a bundle brings along as negatives (qsgm/distractors.py).
+"""The sheet of drawn things that a bundle brings along: see :mod:`qsgm.grasp.distractors`.
 
 Full size with 32 levels a channel packs into less than two thirds of the size with 256. The latter
 would look blurred beside the frame's own crops, which a network soon takes for the difference

@@ -30,7 +30,7 @@ def teach_comparer(
     drawn: EpisodesConfig = DRAWN,
     config: ComparerConfig = ComparerConfig(),  # noqa: B008 (it is frozen)
 ) -> None:
-    """Draw examples, learn from them, and write what :func:`shipped_comparer` reads.
+    """Draw examples, learn from them, and write what `shipped_comparer` reads.
 
     Args:
         checkpoint_path: `sgm.pt`.

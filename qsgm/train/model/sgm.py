@@ -4,7 +4,7 @@ An SGM sees a layer's activation and the label, each label value filling a chann
 and answers with the gradient of every sample's loss with respect to that activation. It is a
 stack of convolutions with batchnorm and ReLU between: (C + L) -> hidden ... -> C, 3x3 where the
 layer gives maps, else 1x1. One hidden convolution as wide as the layer is the paper's
-SGM; two wider ones are the default here (the README's design notes say why). The last layer has
+SGM; two wider ones are the default here (`docs/design.md` says why). The last layer has
 none: its gradient comes from the loss.
 """
 

@@ -1,7 +1,7 @@
 """Post-training quantization: ranges along fine-tuning runs on the calibration set.
 
-calibration_set   demonstration frames in calib/, read one at a time
-calibration_runs  fine-tuning runs on them, as on the device
+lessons           what is asked of a calibration set
+calibration_runs  fine-tuning runs on it, as on the device
 calibrate         the SGMs' ranges along those runs
 sgm_fidelity      int8 SGMs along the runs, compared with float and true gradients
 trunk_ranges      ranges of the frozen layers' activations
