@@ -284,7 +284,7 @@ def test_a_run_that_ends_worse_than_it_began_says_so(
     path = made / "mine" / "manifest.json"
     bad = Path(shutil.copytree(made / "mine", tmp_path / "bad")) / "manifest.json"
     manifest = json.loads(path.read_text())
-    manifest["recipes"]["sgm"]["rates"]["sgd"]["3,4"] = [30.0, 30.0]
+    manifest["recipes"]["sgm"]["rates"]["sgd"]["3,4"] = [1.0, 1.0]
     manifest["recipes"]["sgm"]["optimizers"] = {}
     bad.write_text(json.dumps(manifest))
     met = digits().met(np.random.default_rng(5), 250, own_meanings=False)
