@@ -36,7 +36,6 @@ from qsgm.cli.options import (
     parsed_run_lengths,
     parsed_thread_counts,
     settings_of,
-    value_of,
 )
 from qsgm.network import MOST_LAYERS
 
@@ -80,14 +79,11 @@ def bench_accuracy(
     more than any user could know beforehand.
     """
     from qsgm.bench.accuracy import measure_accuracy, render, report_json
-    from qsgm.tune.settings import Settings
 
     check_picture(pictures)
     lengths = parsed_run_lengths(short)
     some = frames_of(frames, limit)
-    settings = Settings(
-        layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
-    )
+    settings = settings_of(layers=layers, trunk=trunk, epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
         report = measure_accuracy(some, open_bundle(bundle), settings, lengths, watch)
     values = report_json(report)
@@ -187,13 +183,10 @@ def bench_speed(
     `benchmarks/peers` compares single steps with those of other frameworks.
     """
     from qsgm.bench.speed import measure_speed, render
-    from qsgm.tune.settings import Settings
 
     counts = parsed_thread_counts(thread_counts)
     frame = frames_of(frames, 1)[0].path
-    settings = Settings(
-        layers=layers, trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads
-    )
+    settings = settings_of(layers=layers, trunk=trunk, epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
         report = measure_speed(frame, open_bundle(bundle), settings, repeats, watch, counts)
     write_report(report, output)
@@ -237,13 +230,12 @@ def bench_memory(
 ) -> None:
     """Peak of live activations, SGMs against backpropagation, and whole processes (host)."""
     from qsgm.bench.memory import measure_memory, render
-    from qsgm.tune.settings import Settings
 
     lengths = parsed_layer_counts(processes)
     host = host_module("qsgm.train.graphs.memory")
     check_picture(picture)
     frame = frames_of(frames, 1)[0].path
-    settings = Settings(trunk=value_of(trunk), epochs=epochs, seed=seed, threads=threads)
+    settings = settings_of(trunk=trunk, epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
         values = measure_memory(
             frame, open_bundle(bundle), settings, lengths, host.step_memory, watch
@@ -269,10 +261,9 @@ def bench_fidelity(
 ) -> None:
     """int8 gradients against float and true ones along a run on every frame, worst cases named."""
     from qsgm.bench.fidelity import measure_fidelity, render
-    from qsgm.tune.settings import Settings
 
     some = frames_of(frames, limit)
-    settings = Settings(layers=layers, epochs=epochs, seed=seed, threads=threads)
+    settings = settings_of(layers=layers, epochs=epochs, seed=seed, threads=threads)
     with progress() as watch:
         values = measure_fidelity(some, open_bundle(bundle), settings, watch)
     write_report(values, output)
@@ -307,12 +298,11 @@ def bench_calibration(
     """Calibration sets from far to near, calibrators and bit widths, judged on other frames."""
     from qsgm.bench.calibration import VARIANTS, measure_calibration, parse_variant, render
     from qsgm.bench.frames import list_frames
-    from qsgm.tune.settings import Settings
 
     check_picture(picture)
     folder = paths.calibration_folder(calib)
     some = list_frames(frames, limit)
-    settings = Settings(epochs=epochs, seed=seed, threads=threads)
+    settings = settings_of(epochs=epochs, seed=seed, threads=threads)
     chosen = [parsed(parse_variant, one, "--variant") for one in variants or ()] or VARIANTS
     with progress() as watch:
         report = measure_calibration(some, folder, open_bundle(bundle), settings, watch, chosen)

@@ -16,7 +16,6 @@ from qsgm.network import MOST_LAYERS
 
 if TYPE_CHECKING:
     from qsgm.blocks import Blocks
-    from qsgm.manifest import Precision
     from qsgm.tune.settings import Settings
 
 Value = TypeVar("Value")
@@ -185,13 +184,13 @@ ReportOption = Annotated[
 
 
 def settings_of(
-    int8: bool | None,
-    method: MethodName,
-    layers: int,
-    optimizer: OptimizerChoice | None,
-    epochs: int,
-    seed: int,
-    threads: int,
+    int8: bool | None = None,
+    method: MethodName = MethodName.SGM,
+    layers: int = defaults.LAYERS,
+    optimizer: OptimizerChoice | None = None,
+    epochs: int = defaults.EPOCHS,
+    seed: int = 0,
+    threads: int = 1,
     blocks: str | None = None,
     trunk: TrunkChoice | None = None,
 ) -> "Settings":
@@ -205,17 +204,12 @@ def settings_of(
         precision="int8" if int8 and method is MethodName.SGM else "float",
         layers=layers,
         blocks=blocks,
-        trunk=value_of(trunk),
+        trunk=None if trunk is None else trunk.value,
         optimizer=None if optimizer is None else optimizer.value,
         epochs=epochs,
         seed=seed,
         threads=threads,
     )
-
-
-def value_of(trunk: TrunkChoice | None) -> "Precision | None":
-    """A choice as the settings have it."""
-    return None if trunk is None else trunk.value
 
 
 def tuned_layers(layers: int | None, blocks: str | None) -> int:
