@@ -3,8 +3,8 @@
 What stays is what `qsgm finetune` opens for these blocks with the bundle's own optimizers and its
 own precision of the frozen layers: the step with SGMs in int8 and in float, backpropagation, and
 the probe, by which a run says how faithful its gradients are. No number changes, unless loops are
-taken out. `qsgm bench` of speed, memory, resources and growth compares steps that only a whole
-bundle has.
+taken out. `qsgm bench` of speed, memory and resources compares steps that only a whole bundle has,
+and so does `benchmarks/growth`.
 """
 
 import json
