@@ -238,26 +238,31 @@ def _header(path: Path, data: bytes) -> _Header:
     return header
 
 
-def _png_header(data: bytes) -> _Header | None:
-    """None unless the header comes first, once, and every chunk up to the end mark is intact."""
-    header = None
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Kinds and bodies of a PNG's chunks, up to the first one that is not intact."""
     position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
         kind_and_body = memoryview(data)[position + 4 : position + 8 + length]
         checksum = data[position + 8 + length : position + 12 + length]
         if checksum != zlib.crc32(kind_and_body).to_bytes(4, "big"):
-            return None
-        kind = bytes(kind_and_body[:4])
+            return
+        yield bytes(kind_and_body[:4]), kind_and_body[4:]
+        position += 12 + length
+
+
+def _png_header(data: bytes) -> _Header | None:
+    """None unless the header comes first, once, and every chunk up to the end mark is intact."""
+    header = None
+    for kind, body in png_chunks(data):
         # Of two headers decoders take one, and this might take the other.
-        if (kind == b"IHDR") != (header is None) or (kind == b"IHDR" and length != 13):
+        if (kind == b"IHDR") != (header is None) or (kind == b"IHDR" and len(body) != 13):
             return None
         if kind == b"IHDR":
-            width, height = struct.unpack_from(">II", kind_and_body, 4)
+            width, height = struct.unpack_from(">II", body)
             header = _Header(height, width)
         if kind == b"IEND":
             return header
-        position += 12 + length
     return None
 
 

@@ -24,6 +24,7 @@ from qsgm.errors import QsgmError
 from qsgm.grasp.crops import HALF_CROP_PX, POSITIVE_JITTER_PX
 from qsgm.grasp.network import CROP_PX
 from qsgm.grasp.pixels import ZERO, arithmetic
+from qsgm.images import png_chunks
 
 FILE = "distractors.png"
 TILE_PX = 128
@@ -305,8 +306,9 @@ def _unpacked(data: bytes, rows: int, row_bytes: int) -> NDArray[np.uint8]:
     That is the filter which packs few colours best, and the one that any language can read.
     """
     inflate = zlib.decompressobj()
+    packed = b"".join(body for kind, body in png_chunks(data) if kind == b"IDAT")
     try:
-        raw = inflate.decompress(_packed(data), rows * row_bytes + 1)
+        raw = inflate.decompress(packed, rows * row_bytes + 1)
     except zlib.error:
         raw = b""
     if len(raw) != rows * row_bytes or not inflate.eof:
@@ -321,21 +323,6 @@ def _unpacked(data: bytes, rows: int, row_bytes: int) -> NDArray[np.uint8]:
             f"anew"
         )
     return unpacked
-
-
-def _packed(data: bytes) -> bytes:
-    """The compressed data of a PNG, or as much as is there intact."""
-    parts = []
-    position = 8
-    while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        body = data[position + 4 : position + 8 + length]
-        if data[position + 8 + length : position + 12 + length] != zlib.crc32(body).to_bytes(4):
-            break
-        if body[:4] == b"IDAT":
-            parts.append(body[4:])
-        position += 12 + length
-    return b"".join(parts)
 
 
 def _reaches(sprites: NDArray[np.uint8]) -> NDArray[np.int32]:
