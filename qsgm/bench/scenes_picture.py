@@ -43,6 +43,7 @@ _ROW, _TOP, _BOTTOM = 132, 122, 56
 _LABEL_X, _BAR_X, _BAR_WIDTH, _ALARM_X, _ALARM_WIDTH = 28, 172, 300, 522, 150
 _BAR_HEIGHT = 30
 _THUMB = (160, 120)  # width, height
+_LARGE_THUMB = (_SCALE * _THUMB[0], _SCALE * _THUMB[1])
 _THUMB_X, _THUMB_STEP = 722, 170
 _WIDTH = _THUMB_X + EXAMPLES * _THUMB_STEP + 18
 
@@ -62,7 +63,7 @@ class Album:
         column = self._column(judged)
         if column is not None:
             drawn = annotated(scene, judged, thickness=4)
-            small = cv2.resize(drawn, _doubled(_THUMB), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(drawn, _LARGE_THUMB, interpolation=cv2.INTER_AREA)
             self.examples.setdefault(truth.condition, {})[column] = np.asarray(small, np.uint8)
         key = truth.condition, outcome
         if outcome in ("right_place", "quiet") or self._kept.get(key, 0) == PICTURES_OF_EACH:
@@ -223,7 +224,3 @@ def _text(
 
 def _text_width(text: str, size: float) -> float:
     return float(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0])
-
-
-def _doubled(size: tuple[int, int]) -> tuple[int, int]:
-    return _SCALE * size[0], _SCALE * size[1]

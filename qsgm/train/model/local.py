@@ -222,10 +222,17 @@ def group_gradients(
             befores[layer], x = layer_forward(network, layer, of_layer[layer], col)
         gradients[group[-1]] = gradient_of(group[-1], x, labels)
         for layer in group[:0:-1]:
-            dz = through_activation(network, layer, befores[layer], gradients[layer])
-            d_columns = dz @ of_layer[layer].weight.transpose(1, 2)[:, None]
-            gradients[layer - 1] = sum_windows(network, layer, d_columns)
+            weight, before = of_layer[layer].weight, befores[layer]
+            gradients[layer - 1] = to_input(network, layer, weight, before, gradients[layer])
     return gradients
+
+
+def to_input(
+    network: Network, number: int, weight: Tensor, before: Tensor, gradient: Tensor
+) -> Tensor:
+    """The gradient on a layer's activation carried back to its input by (T, K, C) or (K, C)."""
+    dz = through_activation(network, number, before, gradient)
+    return sum_windows(network, number, dz @ weight.transpose(-1, -2).unsqueeze(-3))
 
 
 def sum_windows(network: Network, number: int, windows: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ each module says what it uses. Since every layer's activation comes from its wei
 update, a step equals :func:`qsgm.train.model.local.local_step`, where layers update one by one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -21,8 +21,7 @@ from qsgm.train.model.local import (
     LayerState,
     columns,
     layer_forward,
-    sum_windows,
-    through_activation,
+    to_input,
 )
 
 
@@ -92,20 +91,13 @@ def carry_back(layer: int, weight: Tensor, batch: ForwardPass, gradient: Tensor)
         batch: has to hold the activation of the layer before.
         gradient: on its activation.
     """
-    dz = through_activation(batch.network, layer, batch.before[layer], gradient)
-    windows = dz @ weight.transpose(-1, -2).unsqueeze(-3)
-    return sum_windows(batch.network, layer, windows)
+    return to_input(batch.network, layer, weight, batch.before[layer], gradient)
 
 
 def carry_back_all(weights: Mapping[int, Tensor], batch: ForwardPass) -> dict[int, Tensor]:
     """The output error carried back, layer by layer, to every hidden tuned layer's activation."""
     gradients, gradient = {}, batch.output_error
-    for layer in _last_first(batch):
+    for layer in list(batch.activations)[:0:-1]:
         gradient = carry_back(layer, weights[layer], batch, gradient)
         gradients[layer - 1] = gradient
     return gradients
-
-
-def _last_first(batch: ForwardPass) -> Sequence[int]:
-    """The tuned layers that have a tuned layer before them, from the last on."""
-    return list(batch.activations)[:0:-1]
