@@ -14,25 +14,6 @@ SGM_LAYERS = range(1, 6)
 CHANNELS = GRASPNET.layer(LAYER).out
 
 
-class Case:
-    """A convolution, the SGM's place behind it, and a rest with a mean loss."""
-
-    def __init__(self, hidden: tuple[int, ...] | None = (12, 9)) -> None:
-        torch.manual_seed(0)
-        self.conv, self.rest = nn.Conv2d(4, CHANNELS, 3), nn.Conv2d(CHANNELS, 2, 1)
-        self.sgm = Sgm(GRASPNET, LAYER, hidden).eval()
-        self.x, self.labels = torch.randn(BATCH, 4, 5, 5), torch.randn(BATCH, 3)
-
-    def loss(self, layer: SgmLayer | None) -> Tensor:
-        activation = self.conv(self.x)
-        behind = activation if layer is None else layer(activation, self.labels)
-        return self.rest(behind).square().sum(dim=(1, 2, 3)).mean()
-
-
-def gradients(module: nn.Module) -> list[Tensor | None]:
-    return [None if p.grad is None else p.grad.clone() for p in module.parameters()]
-
-
 def test_parameter_counts_are_the_papers() -> None:
     counts = [sum(p.numel() for p in Sgm(GRASPNET, layer).parameters()) for layer in SGM_LAYERS]
     assert counts == [1400, 1400, 5104, 624, 624]
@@ -43,24 +24,6 @@ def test_parameter_counts_are_the_papers() -> None:
 def test_a_gradient_has_its_activations_shape(layer: int, hidden: tuple[int, ...] | None) -> None:
     activation = torch.randn(2, GRASPNET.layer(layer).out, 7, 6)
     assert Sgm(GRASPNET, layer, hidden)(activation, torch.randn(2, 3)).shape == activation.shape
-
-
-def test_what_lies_before_trains_on_the_synthetic_gradient_over_the_batch() -> None:
-    case = Case()
-    case.loss(SgmLayer(case.sgm)).backward()
-    got, rest = gradients(case.conv), gradients(case.rest)
-
-    activation = case.conv(case.x)
-    injected = case.sgm(activation.detach(), case.labels).detach() / BATCH
-    expected = torch.autograd.grad(activation, list(case.conv.parameters()), injected)
-    for one, other in zip(got, expected, strict=True):
-        assert one is not None
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
-    # What lies behind never notices the SGM.
-    case.rest.zero_grad()
-    case.loss(None).backward()
-    for one, other in zip(rest, gradients(case.rest), strict=True):
-        torch.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("hidden", [None, (64, 64)])
