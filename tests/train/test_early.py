@@ -91,16 +91,16 @@ def test_rates_are_chosen_for_every_number_of_layers_and_those_behind_keep_their
     config = RatesConfig(epochs=1, early_epochs=1)
     start = folded_start(net, 6)
     seen = behind(GRASPNET, start[:3], pixels)
-    late, best = choose_late(Trials(rule, start[3:], seen, config, scores.append))
+    late, best = choose_late(Trials(rule, start[3:], seen, scores.append), config)
     assert [len(late[tuned]) for tuned in (1, 2, 3)] == [1, 2, 3]
     assert len(scores) == len([*late_candidates(rule.rates)])
     lowest = min(score.objective for score in scores[-4:])
     assert lowest <= best.objective <= 1.01 * lowest
     short = RatesConfig(short_epochs=1)
     trial = UpdateRule(rule.sgms, FLAT, late[3], TASK)
-    assert choose_short_gain(Trials(trial, start[3:], seen, short, scores.append)) in SHORT_GAINS
+    assert choose_short_gain(Trials(trial, start[3:], seen, scores.append), short) in SHORT_GAINS
     rule = UpdateRule(rule.sgms, FLAT, late[3], TASK)
-    early = choose_early(Trials(rule, start, pixels, config, scores.append))
+    early = choose_early(Trials(rule, start, pixels, scores.append), config)
     assert sorted(early) == [4, 5, 6]
     assert early[6][1:] == early[5]
     assert early[5][1:] == early[4]

@@ -70,15 +70,15 @@ def test_whole_runs_and_short_ones_count_alike(
 
     told: list[Score] = []
     monkeypatch.setattr(first_rates, "run_sgms", run)
-    found = choose_first(Trials(rule(), start, tasks, LENGTHS, told.append))
+    found = choose_first(Trials(rule(), start, tasks, told.append), LENGTHS)
     assert found == pytest.approx((1.5e-3, 3e-2))
     assert len(told) == len([*candidates(2)])
 
 
 def test_the_rates_chosen_are_those_that_do_best(start: Start, tasks: TaskSet) -> None:
-    trials = Trials(rule(), start, tasks, LENGTHS, lambda _: None)
-    found = choose_first(trials)
-    assert found == choose_first(trials)
+    trials = Trials(rule(), start, tasks, lambda _: None)
+    found = choose_first(trials, LENGTHS)
+    assert found == choose_first(trials, LENGTHS)
 
     def worth(rates: Rates) -> float:
         runs = (LENGTHS.epochs, LENGTHS.short_epochs)

@@ -15,7 +15,7 @@ from qsgm.train.paper.baselines.tuning import adam, tuned_states
 from qsgm.train.pretraining import recipes as module
 from qsgm.train.pretraining.evaluate import Score, UpdateRule, fine_tune, run_each, score
 from qsgm.train.pretraining.map_sgms import behind
-from qsgm.train.pretraining.rates import Start
+from qsgm.train.pretraining.rates import Start, Trials
 from qsgm.train.pretraining.recipes import choose_recipes, late_runs
 from qsgm.train.pretraining.tasks import TaskSet, start_states
 
@@ -59,7 +59,7 @@ def test_every_number_of_layers_has_both_optimizers_and_a_gain_for_every_length(
     start: Start, tasks: TaskSet
 ) -> None:
     told: list[Score] = []
-    found, _ = choose_recipes(rule(), start, tasks, told.append)
+    found, _ = choose_recipes(Trials(rule(), start, tasks, told.append))
     assert len(told) == late_runs(LEARNT)
     assert [*found] == [1, 2]
     for tuned, recipes in found.items():
@@ -75,7 +75,7 @@ def test_every_number_of_layers_has_both_optimizers_and_a_gain_for_every_length(
 @pytest.mark.parametrize("factor", [1, 30])
 def test_at_twice_the_rates_no_run_is_lost(start: Start, tasks: TaskSet, factor: int) -> None:
     louder = replace(tasks, features=factor * tasks.features)
-    found, _ = choose_recipes(rule(), start, louder, lambda _: None)
+    found, _ = choose_recipes(Trials(rule(), start, louder, lambda _: None))
     for tuned, recipes in found.items():
         seen = behind(TASK.network, start[: 2 - tuned], louder, 3)
         before = [one.objective for one in score(start_states(start[2 - tuned :], 3), seen, TASK)]
@@ -92,6 +92,6 @@ def test_the_louder_the_features_the_lower_the_rates(start: Start, tasks: TaskSe
     rates = []
     for factor in (1, 300):
         louder = replace(tasks, features=factor * tasks.features)
-        found, _ = choose_recipes(rule(), start, louder, lambda _: None)
+        found, _ = choose_recipes(Trials(rule(), start, louder, lambda _: None))
         rates.append(next(one for one in found[2] if one.optimizer == "sgd").rates[0])
     assert rates[0] > rates[1]

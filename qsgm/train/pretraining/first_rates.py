@@ -20,7 +20,7 @@ from qsgm.train.pretraining.evaluate import (
     score,
 )
 from qsgm.train.pretraining.matching import MatchingConfig, backprop_step
-from qsgm.train.pretraining.rates import RATE_GRID, Rates, Start, Trials
+from qsgm.train.pretraining.rates import RATE_GRID, Rates, RatesConfig, Start, Trials
 from qsgm.train.pretraining.tasks import TaskSet, shuffled_batches, start_states
 
 ALONE_GRID = (1e-3, 3e-3, 1e-2, 3e-2)
@@ -57,7 +57,7 @@ def rate_alone(
     return best_rates(scores)[0]
 
 
-def choose_first(trials: Trials) -> Rates:
+def choose_first(trials: Trials, config: RatesConfig) -> Rates:
     """The rates of all late layers with which SGMs that regressed gradients do best.
 
     None are known: the rule's do not matter.
@@ -65,7 +65,7 @@ def choose_first(trials: Trials) -> Rates:
     Raises:
         QsgmError: runs diverge at all of them.
     """
-    some, scores, config = next(trials.tasks.chunks(TASKS)), dict[Rates, Score](), trials.config
+    some, scores = next(trials.tasks.chunks(TASKS)), dict[Rates, Score]()
     for rates in candidates(len(trials.start)):
         trial = replace(trials.rule, rates=rates)
         lengths = (config.epochs, config.short_epochs)

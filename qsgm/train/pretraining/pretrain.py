@@ -51,7 +51,6 @@ from qsgm.train.pretraining.rates import (
     SHORT_GAINS,
     AfterRun,
     RatesConfig,
-    Start,
     Trials,
     block_rates,
     choose_early,
@@ -305,7 +304,7 @@ class _Stages:
             return config.first_rates
         after_run = _scored(counted(self.watch, "first rates", len([*candidates(config.late)])))
         rule, start = UpdateRule(sgms, FLAT, (), self.task), folded_start(net, config.late)
-        return choose_first(Trials(rule, start, tasks, config.rates, after_run))
+        return choose_first(Trials(rule, start, tasks, after_run), config.rates)
 
     def _match_on(
         self, net: ConvNet, sgms: dict[int, Sgm], tasks: TaskSet, rates: tuple[float, ...]
@@ -381,16 +380,16 @@ class _Stages:
         )
         total += (network.depth - late + len(groups)) * len(EARLY_RATE_GRID)
         after_run = _scored(counted(self.watch, "rates", total))
-        found = _late_rates(rule, folded_start(net, late), tasks, self.config, after_run)
+        found = _late_rates(Trials(rule, folded_start(net, late), tasks, after_run), self.config)
         rates, rule = dict(found.rates), replace(rule, rates=found.rates[late])
         grouped = {} if self.config.grouped else block_rates(network, rates[late])
         if late < network.depth:
             count, samples = sizes.early_tasks, sizes.early_crops_per_task
             pixels = self._drawn(net, count, samples, 6, network.depth)
             whole = folded_start(net, network.depth)
-            trials = Trials(rule, whole, pixels, sizes, after_run)
-            rates |= choose_early(trials)
-            grouped |= choose_grouped(trials, groups)
+            early = Trials(rule, whole, pixels, after_run)
+            rates |= choose_early(early, sizes)
+            grouped |= choose_grouped(early, sizes, groups)
         singles = {str(single_layers(network.last(k))): one for k, one in rates.items()}
         return singles | grouped, found
 
@@ -413,17 +412,14 @@ def _scored(tell: Callable[..., None]) -> AfterRun:
     return lambda score: tell({"objective": score.objective})
 
 
-def _late_rates(
-    rule: UpdateRule, start: Start, tasks: TaskSet, config: PretrainConfig, after_run: AfterRun
-) -> LateRates:
+def _late_rates(trials: Trials, config: PretrainConfig) -> LateRates:
     """Rates of the layers that were meta-trained, and of fewer."""
-    network = rule.task.network
+    rule, network = trials.rule, trials.rule.task.network
     if not config.by_length:
-        trials = Trials(rule, start, tasks, config.rates, after_run)
-        rates, score = choose_late(trials)
-        whole = replace(rule, rates=rates[len(start)])
-        return LateRates(rates, choose_short_gain(replace(trials, rule=whole)), {}, score)
-    recipes, score = choose_recipes(rule, start, tasks, after_run)
+        rates, score = choose_late(trials, config.rates)
+        trials = replace(trials, rule=replace(rule, rates=rates[len(trials.start)]))
+        return LateRates(rates, choose_short_gain(trials, config.rates), {}, score)
+    recipes, score = choose_recipes(trials)
     rates = {
         tuned: next(one.rates for one in some if one.optimizer == "sgd")
         for tuned, some in recipes.items()

@@ -51,14 +51,22 @@ class Trials:
     rule: UpdateRule  # how layers learn; its rates are those that are known beforehand
     start: Start  # of as many layers
     tasks: TaskSet  # as the first of these layers sees them
-    config: RatesConfig
     after_run: AfterRun  # told about every run
 
-    def seen(self, tuned: int) -> tuple[Start, TaskSet]:
-        """Start and tasks of fewer layers."""
+    def of_last(self, tuned: int) -> "Trials":
+        """The same of fewer layers."""
         network, skipped = self.rule.task.network, len(self.start) - tuned
         first = network.depth + 1 - len(self.start)
-        return self.start[skipped:], behind(network, self.start[:skipped], self.tasks, first)
+        tasks = behind(network, self.start[:skipped], self.tasks, first)
+        # A layer alone has its gradient from the loss, and is trained as by backpropagation.
+        rule = replace(self.rule, curvatures=self.rule.curvatures if tuned > 1 else FLAT)
+        return Trials(rule, self.start[skipped:], tasks, self.after_run)
+
+    def run(self, rates: Rates, epochs: int, chunk: int = 8) -> Score:
+        """What comes of a run with these rates, so many tasks at once."""
+        score = run_sgms(replace(self.rule, rates=rates), self.start, self.tasks, epochs, chunk)
+        self.after_run(score)
+        return score
 
 
 def block_rates(network: Network, meta_rates: Rates) -> dict[str, Rates]:
@@ -81,65 +89,60 @@ def late_candidates(meta_rates: Rates) -> Iterator[Rates]:
     yield from (tuple(factor * rate for rate in meta_rates) for factor in META_RATE_FACTORS)
 
 
-def choose_late(trials: Trials) -> tuple[dict[int, Rates], Score]:
+def choose_late(trials: Trials, config: RatesConfig) -> tuple[dict[int, Rates], Score]:
     """The best rates for few layers, by their number, and the score of the most.
 
     Known are the meta-trained ones, of all layers that the trials start with.
     """
-    rule, most, scores = trials.rule, len(trials.start), dict[int, dict[Rates, Score]]()
-    for rates in late_candidates(rule.rates):
-        tuned = len(rates)
-        # A layer alone has its gradient from the loss, and is trained as by backpropagation.
-        trial = replace(rule, rates=rates, curvatures=rule.curvatures if tuned > 1 else FLAT)
-        score = run_sgms(trial, *trials.seen(tuned), trials.config.epochs)
-        scores.setdefault(tuned, {})[rates] = score
-        trials.after_run(score)
+    most, scores = len(trials.start), dict[int, dict[Rates, Score]]()
+    for rates in late_candidates(trials.rule.rates):
+        score = trials.of_last(len(rates)).run(rates, config.epochs)
+        scores.setdefault(len(rates), {})[rates] = score
     best = {tuned: best_rates(of_tuned) for tuned, of_tuned in scores.items()}
     return best, scores[most][best[most]]
 
 
-def choose_short_gain(trials: Trials) -> float:
+def choose_short_gain(trials: Trials, config: RatesConfig) -> float:
     """What the rates of a whole run are best multiplied with in a short one."""
     scores: dict[Rates, Score] = {}
     for gain in SHORT_GAINS:
-        trial = replace(trials.rule, rates=tuple(gain * rate for rate in trials.rule.rates))
-        score = run_sgms(trial, trials.start, trials.tasks, trials.config.short_epochs)
-        scores[(gain,)] = score
-        trials.after_run(score)
+        rates = tuple(gain * rate for rate in trials.rule.rates)
+        scores[(gain,)] = trials.run(rates, config.short_epochs)
     return best_rates(scores)[0]
 
 
-def choose_grouped(trials: Trials, every: Sequence[Blocks]) -> dict[str, Rates]:
+def choose_grouped(
+    trials: Trials, config: RatesConfig, every: Sequence[Blocks]
+) -> dict[str, Rates]:
     """The best rates for layers in groups: one for all in front of those that are known.
 
     Args:
         trials: of all layers.
+        config: sizes.
         every: groups of more layers than are known.
     """
     return {
-        str(one): _with_early(trials, replace(trials.rule, blocks=one), len(one.layers))
+        str(one): _with_early(trials, replace(trials.rule, blocks=one), len(one.layers), config)
         for one in every
     }
 
 
-def choose_early(trials: Trials) -> dict[int, Rates]:
+def choose_early(trials: Trials, config: RatesConfig) -> dict[int, Rates]:
     """The best rates for many layers, one more at a time: those behind keep theirs.
 
     Known are those of fewer layers than the trials start with, which are all.
     """
     rule, chosen = trials.rule, dict[int, Rates]()
     for tuned in range(len(rule.rates) + 1, len(trials.start) + 1):
-        chosen[tuned] = _with_early(trials, rule, tuned)
+        chosen[tuned] = _with_early(trials, rule, tuned, config)
         rule = replace(rule, rates=chosen[tuned])
     return chosen
 
 
-def _with_early(trials: Trials, rule: UpdateRule, tuned: int) -> Rates:
+def _with_early(trials: Trials, rule: UpdateRule, tuned: int, config: RatesConfig) -> Rates:
     """The rule's rates, and in front of them the best one of a few, up to so many layers."""
-    scores, (start, tasks) = dict[Rates, Score](), trials.seen(tuned)
+    scores, trial = dict[Rates, Score](), replace(trials, rule=rule).of_last(tuned)
     for rate in EARLY_RATE_GRID:
         rates = (rate,) * (tuned - len(rule.rates)) + rule.rates
-        trial = replace(rule, rates=rates)
-        scores[rates] = run_sgms(trial, start, tasks, trials.config.early_epochs, chunk=1)
-        trials.after_run(scores[rates])
+        scores[rates] = trial.run(rates, config.early_epochs, chunk=1)
     return best_rates(scores)

@@ -16,14 +16,12 @@ from qsgm.task import Task
 from qsgm.train.model.curvature import FLAT
 from qsgm.train.pretraining.evaluate import (
     Score,
-    UpdateRule,
     best_rates,
     mean_score,
     run_each,
     score,
 )
-from qsgm.train.pretraining.map_sgms import behind
-from qsgm.train.pretraining.rates import AfterRun, Rates, Start
+from qsgm.train.pretraining.rates import Rates, Start, Trials
 from qsgm.train.pretraining.tasks import TaskSet, start_states
 
 LENGTHS = (1, 3, 20)  # epochs
@@ -82,16 +80,10 @@ def late_runs(learnt: Rates) -> int:
     return len(LENGTHS) * sum(len([*shapes(tuned, learnt)]) for tuned in layers)
 
 
-def choose_recipes(
-    rule: UpdateRule, start: Start, tasks: TaskSet, after_run: AfterRun
-) -> tuple[dict[int, tuple[Recipe, ...]], Score]:
+def choose_recipes(trials: Trials) -> tuple[dict[int, tuple[Recipe, ...]], Score]:
     """By the number of layers a recipe for each optimizer, the usual one first.
 
-    Args:
-        rule: how layers learn; its rates are the meta-trained ones.
-        start: of as many layers as there are meta-trained rates.
-        tasks: as the first of these layers sees them.
-        after_run: told about every shape's runs of a length.
+    Known are the meta-trained rates, of all layers that the trials start with.
 
     Returns:
         Recipes, and what the longest run of the most layers by SGD comes to.
@@ -99,14 +91,9 @@ def choose_recipes(
     Raises:
         QsgmError: runs diverge at all rates.
     """
-    network, most, found = rule.task.network, len(start), {}
-    for tuned in range(1, most + 1):
-        skipped = most - tuned
-        seen = behind(network, start[:skipped], tasks, network.depth + 1 - most)
-        # A layer alone has its gradient from the loss, and is trained as by backpropagation.
-        trial = replace(rule, curvatures=rule.curvatures if tuned > 1 else FLAT)
-        found[tuned] = _by_optimizer(trial, start[skipped:], seen, rule.rates, after_run)
-    steps = [epochs * -(-tasks.support // BATCH) for epochs in LENGTHS]
+    most, learnt = len(trials.start), trials.rule.rates
+    found = {k: _by_optimizer(trials.of_last(k), learnt) for k in range(1, most + 1)}
+    steps = [epochs * -(-trials.tasks.support // BATCH) for epochs in LENGTHS]
     recipes = {
         tuned: tuple(one.recipe(steps) for one in _usual_first(chosen))
         for tuned, chosen in found.items()
@@ -119,17 +106,15 @@ def _usual_first(chosen: Mapping[OptimizerName, Chosen]) -> list[Chosen]:
     return [adam, sgd] if adam.objective < WORTH * sgd.objective else [sgd, adam]
 
 
-def _by_optimizer(
-    rule: UpdateRule, start: Start, tasks: TaskSet, learnt: Rates, after_run: AfterRun
-) -> dict[OptimizerName, Chosen]:
+def _by_optimizer(trials: Trials, learnt: Rates) -> dict[OptimizerName, Chosen]:
     """The best shape of each optimizer."""
-    bounds, best = lost_beyond(start, tasks, rule.task), dict[OptimizerName, Chosen]()
-    for shape in shapes(len(start), learnt):
+    rule, best = trials.rule, dict[OptimizerName, Chosen]()
+    bounds = lost_beyond(trials.start, trials.tasks, rule.task)
+    for shape in shapes(len(trials.start), learnt):
         name, _ = shape
-        trial = replace(
-            rule, optimizer=name, curvatures=FLAT if name == "adam" else rule.curvatures
-        )
-        chosen = _of_shape(trial, shape, start, tasks, bounds, after_run)
+        curvatures = FLAT if name == "adam" else rule.curvatures
+        trial = replace(trials, rule=replace(rule, optimizer=name, curvatures=curvatures))
+        chosen = _of_shape(trial, shape, bounds)
         if name not in best or chosen.objective < best[name].objective:
             best[name] = chosen
     return best
@@ -146,22 +131,15 @@ def lost_beyond(start: Start, tasks: TaskSet, task: Task) -> list[float]:
     return [one.objective + typical for one in before]
 
 
-def _of_shape(
-    rule: UpdateRule,
-    shape: Shape,
-    start: Start,
-    tasks: TaskSet,
-    bounds: Sequence[float],
-    after_run: AfterRun,
-) -> Chosen:
+def _of_shape(trials: Trials, shape: Shape, bounds: Sequence[float]) -> Chosen:
     """The best scale of one shape at each length."""
     scales, scores = list[float](), list[Score]()
     for epochs in LENGTHS:
 
         def run(scale: float, epochs: int = epochs) -> tuple[Score, bool]:
             """What comes of a scale, and whether no run is lost."""
-            trial = replace(rule, rates=tuple(scale * rate for rate in shape[1]))
-            each = run_each(trial, start, tasks, epochs, chunk=len(tasks))
+            trial = replace(trials.rule, rates=tuple(scale * rate for rate in shape[1]))
+            each = run_each(trial, trials.start, trials.tasks, epochs, chunk=len(trials.tasks))
             pairs = zip(each, bounds, strict=True)
             return mean_score(each), all(one.objective <= bound for one, bound in pairs)
 
@@ -169,7 +147,7 @@ def _of_shape(
         scale = highest(tried)
         scales.append(scale)
         scores.append(tried[scale])
-        after_run(tried[scale])
+        trials.after_run(tried[scale])
     return Chosen(shape, tuple(scales), tuple(scores))
 
 
