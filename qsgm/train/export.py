@@ -41,7 +41,7 @@ from qsgm.schedule import Gains
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import ActivationBits, QuantizedSgm, quantize_sgm
 from qsgm.train.checkpoint import Checkpoint, load_checkpoint
-from qsgm.train.export_report import ExportReport, GroupRow, LayerReport, Provenance, model_card
+from qsgm.train.export_report import ExportReport, GroupRow, LayerReport, model_card
 from qsgm.train.graphs.inspection import refuse_float_products
 from qsgm.train.graphs.memory import with_peaks
 from qsgm.train.graphs.optimizers import OPTIMIZERS, Optimizer
@@ -144,7 +144,8 @@ def export_bundle(
     if usual:
         texts = {tuned: str(blocks) for tuned, blocks in usual.items()}
         manifest = replace(manifest, usual_blocks=texts)
-    files["README.md"] = model_card(report, provenance(checkpoint_path, trainee, lessons)).encode()
+    card = model_card(report, checkpoint_path, trainee.checkpoint.card, lessons)
+    files["README.md"] = card.encode()
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():
             (new / name).write_bytes(data)
@@ -197,12 +198,6 @@ def every_block(network: Network, most_layers: int, blocks: Sequence[Blocks]) ->
     """Blocks with SGMs, and for every number of layers all of them as one block."""
     whole = (one_block(network.last(tuned)) for tuned in range(1, most_layers + 1))
     return list(dict.fromkeys([*blocks, *whole]))
-
-
-def provenance(path: Path, trainee: Trainee, lessons: Lessons) -> Provenance:
-    """What a bundle is made from: a checkpoint's file and a calibration set."""
-    checksum, card = sha256(path.read_bytes()), trainee.checkpoint.card
-    return Provenance(path.name, checksum, card, len(lessons), lessons.sha256)
 
 
 @torch.no_grad()

@@ -1,18 +1,21 @@
 """What exporting found out: as JSON, as a table, and as the bundle's model card."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
 
 from qsgm.fidelity import LayerFidelity
+from qsgm.files import sha256
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, constants
 from qsgm.tables import TIGHT, legend, table
 from qsgm.train.quantization.calibrate import EQUAL_COSINE, Calibration
+from qsgm.train.quantization.lessons import Lessons
 from qsgm.tune.report import fidelity_json
 
 # (line break: in a terminal only)
@@ -158,17 +161,6 @@ class ExportReport:
         return Group(layers, legend(LEGEND + "\n"), calibrators(self.calibration), *groups)
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """What a bundle was made from."""
-
-    checkpoint_name: str
-    checkpoint_sha256: str
-    card: dict[str, Any]  # of the checkpoint
-    frames: int
-    calibration_sha256: str  # of the calibration set's manifest
-
-
 def calibrators(calibration: Calibration) -> RenderableType:
     """Whose ranges each SGM has, and why."""
     why = legend(ranges_from(calibration))
@@ -221,8 +213,17 @@ def markdown(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [headers, ["--:"] * len(headers), *rows])
 
 
-def model_card(report: ExportReport, provenance: Provenance) -> str:
-    """The bundle's README.md."""
+def model_card(
+    report: ExportReport, checkpoint: Path, made: Mapping[str, Any], lessons: Lessons
+) -> str:
+    """The bundle's README.md.
+
+    Args:
+        report: on its export.
+        checkpoint: that it was made from.
+        made: the checkpoint's own card.
+        lessons: the calibration set.
+    """
     headers = [" ".join(header.split()) for header in _HEADERS]
     lines = markdown(headers, [one.cells() for one in report.layers.values()])
     calibration = report.calibration
@@ -230,7 +231,7 @@ def model_card(report: ExportReport, provenance: Provenance) -> str:
     if judged(calibration):
         rows = calibrator_rows(calibration)
         whose += f"\n\n{markdown(calibrator_headers(calibration), rows)}"
-    card = json.dumps(provenance.card, indent=1, sort_keys=True)
+    card = json.dumps(made, indent=1, sort_keys=True)
     bits = {layer.int8_sgm.bits for layer in report.layers.values()}
     planes = "one plane" if bits == {8} else "two planes"
     return f"""# GraspNet with int8 synthetic gradient modules
@@ -252,11 +253,11 @@ is in them. Batchnorm is folded into the convolutions (largest change of any out
 
 ## Made from
 
-    qsgm fold-and-quantize {provenance.checkpoint_name}
+    qsgm fold-and-quantize {checkpoint.name}
 
-- checkpoint: sha256 `{provenance.checkpoint_sha256}`
-- calibration set: {provenance.frames} frames, sha256 of its manifest
-  `{provenance.calibration_sha256}`
+- checkpoint: sha256 `{sha256(checkpoint.read_bytes())}`
+- calibration set: {len(lessons)} frames, sha256 of its manifest
+  `{lessons.sha256}`
 
 How the checkpoint was pretrained, and what it scored:
 
