@@ -10,7 +10,7 @@ from qsgm.grasp.angles import wrap_half_turn
 from qsgm.train.grasp.drawing.camera import FRAME_HW
 from qsgm.train.grasp.drawing.noise import Colour, blur, white_noise
 from qsgm.train.grasp.drawing.parts import Brush
-from qsgm.train.grasp.drawing.render import Light, Sprite, fitted, render
+from qsgm.train.grasp.drawing.render import Light, Sprite, fitted, rectangle, render
 from qsgm.train.grasp.drawing.shapes import ELONGATED
 from qsgm.train.grasp.drawing.tables import draw_table
 
@@ -50,11 +50,11 @@ _DEMONSTRATION = _View(CENTER_PX, 0.35, (0, 0), Light(-0.5, -0.4, 0.77), (1.0, 1
 _SCENE = _View((207, 301), 1.40, (150, 90), Light(0.55, -0.3, 0.78), (0.8, 0.9, 0.97), -0.2)
 
 
-def draw_demo(seed: int, object_kind: str = "handle_tool", table_kind: str = "planks") -> Demo:
+def draw_demo(seed: int) -> Demo:
     """Draw both pictures; the same numbers give the same pictures."""
-    table = draw_table(np.random.default_rng([seed, 0]), table_kind, (600, 800))
+    table = draw_table(np.random.default_rng([seed, 0]), "planks", (600, 800))
     brush = Brush(np.random.default_rng([seed, 1]), _mean_colour(table))
-    outline = ELONGATED[object_kind](np.random.default_rng([seed, 2]), brush)
+    outline = ELONGATED["handle_tool"](np.random.default_rng([seed, 2]), brush)
     shape = fitted(outline, LONG_PX, LEAST_ELONGATION, LEAST_PX)
     pictures = []
     for i, view in enumerate((_DEMONSTRATION, _SCENE)):
@@ -77,7 +77,8 @@ def _mean_colour(image: Image) -> Colour:
 def _put(table: Image, sprite: Sprite, view: _View) -> NDArray[np.float32]:
     """The table with the object's shadow and the object on it."""
     side = len(sprite.coverage)
-    left, top = _corner(sprite, view.center_px)
+    (x, y), _ = rectangle(sprite)
+    left, top = round(view.center_px[0] - x), round(view.center_px[1] - y)
     place = slice(top, top + side), slice(left, left + side)
     covered = np.zeros(FRAME_HW, np.float32)
     covered[place] = sprite.opacity
@@ -88,13 +89,6 @@ def _put(table: Image, sprite: Sprite, view: _View) -> NDArray[np.float32]:
     picture = table.astype(np.float32) * shadow[..., None]
     picture[place] = picture[place] * (1 - sprite.opacity[..., None]) + sprite.colour
     return np.asarray(picture, np.float32)
-
-
-def _corner(sprite: Sprite, center_px: tuple[int, int]) -> tuple[int, int]:
-    """Where (x, y) the sprite goes so that its minimum-area rectangle is centred there [px]."""
-    points = cv2.findNonZero((sprite.coverage >= 0.5).astype(np.uint8))
-    (x, y), _, _ = cv2.minAreaRect(points)
-    return round(center_px[0] - x), round(center_px[1] - y)
 
 
 def _seen(picture: NDArray[np.float32], view: _View, rng: np.random.Generator) -> Image:

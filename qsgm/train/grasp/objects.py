@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from qsgm.grasp.angles import wrap_half_turn
 from qsgm.train.grasp.drawing.camera import FRAME_HW, random_light, seen_by_camera
 from qsgm.train.grasp.drawing.noise import Colour, Field, blur, cast_shadow, mean_colour
-from qsgm.train.grasp.drawing.render import LEAST_CONTRAST, Light, Sprite, contrast, render
+from qsgm.train.grasp.drawing.render import (
+    LEAST_CONTRAST,
+    Light,
+    Sprite,
+    contrast,
+    rectangle,
+    render,
+)
 from qsgm.train.grasp.drawing.shapes import (
     OBJECT_KINDS,
     TRIES,
@@ -64,7 +71,7 @@ def draw_frame(
     light = random_light(rng)
     sprite = _random_sprite(rng, object_kind, mean_colour(table), light)
     # Pixels, not outlines, decide where the rectangle's centre is: it is moved there whole.
-    rect = _rectangle(sprite.coverage >= 0.5)
+    rect = rectangle(sprite)
     corner = (round(320 - rect[0][0]), round(240 - rect[0][1]))
     image = _composed(rng, table, sprite, corner, light)
     image = seen_by_camera(rng, image, light)
@@ -91,13 +98,6 @@ def _random_sprite(rng: np.random.Generator, kind: str, table: Colour, light: Li
         if contrast(sprite, table) > LEAST_CONTRAST:
             break
     return sprite
-
-
-def _rectangle(mask: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Centre (x, y) and side lengths [px] of a mask's minimum-area rectangle."""
-    points = cv2.findNonZero(mask.astype(np.uint8))
-    centre, size, _ = cv2.minAreaRect(points)
-    return (float(centre[0]), float(centre[1])), (float(size[0]), float(size[1]))
 
 
 def _principal_axis(mask: NDArray[np.bool_]) -> float:

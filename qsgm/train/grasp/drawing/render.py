@@ -168,6 +168,13 @@ def contrast(sprite: Sprite, table: Colour) -> float:
     return float(np.abs(sprite.colour - hidden).max(axis=-1).sum() / area)
 
 
+def rectangle(sprite: Sprite) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Centre (x, y) and side lengths [px] of a sprite's minimum-area rectangle."""
+    points = cv2.findNonZero((sprite.coverage >= 0.5).astype(np.uint8))
+    centre, size, _ = cv2.minAreaRect(points)
+    return (float(centre[0]), float(centre[1])), (float(size[0]), float(size[1]))
+
+
 def _turned(layer: NDArray[np.uint8], angle: float, side: int) -> NDArray[np.uint8]:
     """A supersampled layer turned about its centre and shrunk to ``side`` pixels square."""
     grown = side * SUPERSAMPLING
