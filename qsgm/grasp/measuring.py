@@ -7,7 +7,8 @@ with it, hardly ever does. An object that is large in its frame has too little a
 it is cut out of the whole frame.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise, zip_longest
 from math import sqrt
 
@@ -25,7 +26,7 @@ Point = tuple[float, float]
 LEAST_SPAN_PX, LARGEST_SPAN_PX = 45.0, 124.0
 IDEAL_SPAN_PX = 90.0
 MOST_ENLARGED = 2.0
-# An object that spans more of its frame's shorter side has nothing around it.
+# An object that spans more of its frame's longer side has nothing around it.
 LARGEST_SHARE = 0.95
 # Spans in two halvings that differ by less than this factor are of the same thing.
 _SAME_SPAN = 1.25
@@ -37,12 +38,19 @@ _LEAST_HALVED_PX = 3 * PATCH_PX // 4
 _LARGE_SHARE = 0.12
 # Of a halving's pixels: a cut that spans less is mostly noise.
 _LEAST_CUT_PX = 18.0
-# Cut out of the whole frame: its shorter side then, how far from the centre the object probably
-# reaches and surely is, and what it spans at least, as shares of that side.
-_WHOLE_PX, _PROBABLE_SHARE, _SURE_SHARE, _LEAST_WHOLE_SHARE = 96, 0.3, 0.12, 0.2
+# Cut out of the whole frame: its shorter side then, and as shares of it how far from the centre the
+# object may reach, where it surely is, and what it spans at least.
+_WHOLE_PX, _REACHES, _SURE_SHARE, _LEAST_WHOLE_SHARE = 96, (0.3, 0.5, 0.65), 0.12, 0.2
+# What lies in several parts has to lie that much better in the middle, of its span, than one part.
+_IN_PARTS = 0.08
+_LEAST_PART_PX = 12
+# The image's gradient along the edge of an object, over what it is elsewhere: light on a cloth ends
+# gradually.
+_LEAST_EDGE = 1.3
 # A span on which nothing agrees is a guess, and this share of the shorter side the largest.
 _LARGEST_GUESS = 0.5
 _RIM_PX = 2  # of the whole frame, made small: table, whatever it looks like
+_NEXT, _AROUND = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
 
 
 def measured_span(frame: Frame, center_px: Point) -> float | None:
@@ -71,7 +79,7 @@ def scale_for(span_px: float | None, frame_hw: tuple[int, int]) -> float:
     """
     if span_px is None or LEAST_SPAN_PX <= span_px <= LARGEST_SPAN_PX:
         return 1.0
-    if span_px > LARGEST_SHARE * min(frame_hw):
+    if span_px > LARGEST_SHARE * max(frame_hw):
         height, width = frame_hw
         raise QsgmError(
             f"the object spans about {span_px:.0f} px of the {width}x{height} frame, which leaves "
@@ -117,25 +125,78 @@ def _spans(frame: Frame, center_px: Point) -> list[float | None]:
     return spans
 
 
+@dataclass(frozen=True)
+class _Cut:
+    """What may be the object, in the whole frame made small."""
+
+    span_px: float
+    wide_px: float  # its shorter side
+    off_middle: float  # how far from where the object was shown, of its span
+    edge: float  # the image's gradient along it, over that elsewhere
+
+
 def _span_of_large(frame: Frame, center_px: Point) -> float | None:
-    """The span of an object that takes up much of its frame, by a cut of all of it."""
-    shorter = min(frame.shape[:2])
+    """The span of an object that takes up much of its frame, by cuts of all of it.
+
+    How far it reaches is not known, nor whether it is seen in one piece. Of several cuts that one
+    counts which lies best in the middle of what was shown: a part of the object hardly ever does.
+    What reaches from border to border counts as large as its frame.
+    """
+    shorter, longer = sorted(frame.shape[:2])
     small = scaled_frame(frame, _WHOLE_PX / shorter)
-    x, y = moved_point(center_px, frame.shape[:2], small.shape[:2])
-    down, right = np.ogrid[: small.shape[0], : small.shape[1]]
-    away = np.hypot(right - x, down - y)
-    trimap = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
-    inner = slice(_RIM_PX, -_RIM_PX)
-    trimap[inner, inner] = cv2.GC_PR_BGD
-    trimap[away < _PROBABLE_SHARE * _WHOLE_PX] = cv2.GC_PR_FGD
-    found = cut_out(small, trimap).astype(np.uint8)
-    _, parts = cv2.connectedComponents(found)
-    middle = parts[(away < _SURE_SHARE * _WHOLE_PX) & (found > 0)]
-    if not middle.size:
+    middle = moved_point(center_px, frame.shape[:2], small.shape[:2])
+    cuts = [cut for reach in _REACHES for cut in _cuts_of_whole(small, middle, reach)]
+    least = _LEAST_WHOLE_SHARE * _WHOLE_PX
+    sound = [cut for cut in cuts if cut.span_px >= least and cut.edge >= _LEAST_EDGE]
+    best = min(sound, key=lambda cut: cut.off_middle, default=None)
+    if best is None:
         return None
-    object_pixels = np.argwhere(parts == np.bincount(middle).argmax()).astype(np.float32)
-    span = float(max(cv2.minAreaRect(object_pixels)[1])) * shorter / _WHOLE_PX
-    return span if _LEAST_WHOLE_SHARE * shorter <= span else None
+    fills = best.wide_px > _WHOLE_PX - 2 * _RIM_PX - 2
+    return float(longer) if fills else best.span_px * shorter / _WHOLE_PX
+
+
+def _cuts_of_whole(small: Frame, middle: Point, reach: float) -> Iterator[_Cut]:
+    """What lies in the middle, then all that does not reach the border, if it is in parts."""
+    down, right = np.ogrid[: small.shape[0], : small.shape[1]]
+    away = np.hypot(right - middle[0], down - middle[1])
+    inner = np.zeros(small.shape[:2], np.bool_)
+    inner[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
+    trimap = np.where(inner, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+    trimap[inner & (away < reach * _WHOLE_PX)] = cv2.GC_PR_FGD
+    found, slope = cut_out(small, trimap), _slope(small)
+    count, parts, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+    in_middle = parts[found & (away < _SURE_SHARE * _WHOLE_PX)]
+    if in_middle.size:
+        yield _cut_of(parts == np.bincount(in_middle).argmax(), middle, slope)
+    outermost = set(parts[_edge(inner)].tolist())
+    whole = [
+        part
+        for part in range(1, count)
+        if sizes[part, cv2.CC_STAT_AREA] >= _LEAST_PART_PX and part not in outermost
+    ]
+    if whole:
+        yield _cut_of(np.isin(parts, whole), middle, slope, _IN_PARTS)
+
+
+def _cut_of(
+    pixels: NDArray[np.bool_], middle: Point, slope: NDArray[np.uint8], handicap: float = 0.0
+) -> _Cut:
+    (y, x), size, _ = cv2.minAreaRect(np.argwhere(pixels).astype(np.float32))
+    (wide, span), edge = sorted(size), _edge(pixels)
+    near = cv2.dilate(edge.astype(np.uint8), _AROUND) > 0
+    elsewhere = 1.0 + float(np.median(slope[~near])) if not near.all() else np.inf
+    off = float(np.hypot(x - middle[0], y - middle[1])) / max(span, 1.0) + handicap
+    return _Cut(span, wide, off, float(np.median(slope[edge])) / elsewhere)
+
+
+def _slope(image: Frame) -> NDArray[np.uint8]:
+    """How much the levels of an image (h, w, 3) differ around each pixel: (h, w)."""
+    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_GRADIENT, _NEXT).max(axis=-1), np.uint8)
+
+
+def _edge(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The outermost of some pixels (h, w)."""
+    return np.asarray(pixels & (cv2.erode(pixels.astype(np.uint8), _NEXT) == 0))
 
 
 def _span_between(frame: Frame, center_px: Point, spans: Sequence[float | None]) -> float | None:

@@ -1,5 +1,6 @@
 """How large an object is, whatever the camera: measured, scaled by, and refused in one line."""
 
+import math
 from typing import Any
 
 import cv2
@@ -16,6 +17,11 @@ from qsgm.grasp.measuring import (
     scale_for,
     scaled_frame,
 )
+
+
+def _at(point: Any) -> tuple[int, int]:
+    x, y = point
+    return round(float(x)), round(float(y))
 
 
 def shown(scale: float, frame_hw: tuple[int, int] = (480, 640), turn_deg: float = 25) -> Any:
@@ -60,6 +66,27 @@ def test_a_larger_thing_close_by_is_not_what_lies_at_the_centre() -> None:
     assert _span_of_large(frame, (320.0, 240.0)) == pytest.approx(130, rel=0.1)
 
 
+@pytest.mark.parametrize("turn_deg", [0, 50])
+def test_a_large_object_is_measured_whole_though_its_ends_look_like_nothing_else(
+    turn_deg: float,
+) -> None:
+    """As of shears: black grips far from the middle, a steel blade over it."""
+    frame, center = table(1), (320.0, 240.0)
+    along = np.array([math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))])
+    grip, tip = (np.asarray(center) + side * 200 * along for side in (-1, 1))
+    cv2.line(frame, _at(grip), _at(tip), (215, 215, 215), 14, cv2.LINE_AA)
+    cv2.circle(frame, _at(grip + 40 * along), 40, (15, 15, 15), cv2.FILLED, cv2.LINE_AA)
+    assert measured_span(frame, center) == pytest.approx(404, rel=0.1)
+
+
+def test_a_large_object_in_two_parts_is_measured_as_one() -> None:
+    """As of sunglasses, whose bridge is too thin to be seen."""
+    frame, center = table(1), (320.0, 240.0)
+    for side in (-1, 1):
+        cv2.ellipse(frame, (320 + side * 105, 240), (80, 55), 0, 0, 360, (30, 25, 25), cv2.FILLED)
+    assert measured_span(frame, center) == pytest.approx(370, rel=0.1)
+
+
 def test_a_table_that_looks_like_a_large_thing_is_not_taken_for_one() -> None:
     """A spoon on a blotchy cloth: no two cuts agree, and the largest spans half of the frame."""
     (subject,) = (one for one in drawn_subjects(5) if one.name == "cutlery_11")
@@ -95,10 +122,21 @@ def test_others_are_scaled_until_they_do(
 
 
 def test_an_object_that_fills_its_frame_is_refused_in_one_line() -> None:
-    with pytest.raises(QsgmError, match=r"spans about 460 px of the 640x480 frame, .* step") as got:
-        scale_for(460, (480, 640))
+    with pytest.raises(QsgmError, match=r"spans about 620 px of the 640x480 frame, .* step") as got:
+        scale_for(620, (480, 640))
     assert "\n" not in str(got.value)
     assert "--span" in str(got.value)
+
+
+def test_a_long_object_may_span_more_than_the_frames_shorter_side_but_no_round_one() -> None:
+    bar, disc = table(1), table(1)
+    cv2.line(bar, (70, 240), (570, 240), (40, 60, 200), 40)
+    cv2.circle(disc, (320, 240), 260, (40, 60, 200), cv2.FILLED)
+    long_px = measured_span(bar, (320.0, 240.0))
+    assert long_px == pytest.approx(540, rel=0.05)
+    assert scale_for(long_px, (480, 640)) == pytest.approx(90 / 540, rel=0.05)
+    with pytest.raises(QsgmError, match="nothing around it"):
+        scale_for(measured_span(disc, (320.0, 240.0)), (480, 640))
 
 
 def test_a_point_stays_on_the_same_spot_of_a_scaled_frame() -> None:
