@@ -3,7 +3,8 @@
 import os
 from typing import Literal
 
-EPOCHS = 20
+EPOCHS = 10  # over an object's 800 crops: twice as many do no better (docs/design.md)
+SAMPLE_EPOCHS = 20  # over samples of one's own, which may be few
 SHORT_RUNS = "1,3"  # epochs, of `bench accuracy`
 LAYERS = 3  # tuned
 # Of the SGMs: as accurate as int8 and the quicker one at these widths (docs/cost.md).

@@ -127,7 +127,7 @@ def test_the_command_line_tunes_and_answers_by_the_names_of_heads(
     told = ["--bundle", made / "mine", "--task", FILE, "--int8", "-o", tuned]
     report = printed(capsys, "finetune", *told, path)
     assert report["task"] == "digits"
-    assert report["layers"] == 2
+    assert (report["layers"], report["epochs"]) == (2, 20)
     assert report["samples"] == {"taught": 200, "held_out": 50}
     before = report["zero_shot"]["digit_accuracy"]
     assert report["scores"]["digit_accuracy"] > before + 0.4
@@ -340,6 +340,7 @@ def test_the_built_in_task_takes_a_bundle_of_arrays_without_a_file(
 def test_three_lines_on_a_device_do_as_the_command_line(made: Path, tmp_path: Path) -> None:
     task, bundle = digits(), load_bundle(made / "mine")
     result = learn(task.read(samples(tmp_path / "hand.npz")), bundle, task)
+    assert (len(result.plan.layers), result.plan.epochs) == (2, 20)
     result.save(tmp_path / "tuned", "hand")
     asked = task.met(np.random.default_rng(5), 20)
     again = load_network(tmp_path / "tuned").answers(asked.inputs)

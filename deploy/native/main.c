@@ -63,7 +63,7 @@ static void look(const char *folder, const Frame *frame) {
 }
 
 int main(int count, char **arguments) {
-    Settings set = {.epochs = 20, .name = "object"};
+    Settings set = {.epochs = 10, .name = "object"};
     const char *raw_size = NULL, *middle = NULL;
     char *given[4] = {NULL};
     int known = 0;

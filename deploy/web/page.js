@@ -3,7 +3,7 @@
 import { addCrops, Course, percent, verdictOn } from "./course.js";
 import { Stage, stroke } from "./stage.js";
 
-const EPOCHS = 20;
+const EPOCHS = 10;
 const PATIENCE_MS = 3000;
 const $ = (id) => document.getElementById(id);
 

@@ -30,10 +30,10 @@ from qsgm.cli.options import (
     Device,
     DistanceOption,
     Encoding,
-    EpochsOption,
     FrameArgument,
     FramesArgument,
     JsonOption,
+    LessonEpochsOption,
     MethodName,
     MethodOption,
     ObjectsOption,
@@ -65,7 +65,7 @@ from qsgm.cli.samples import (
     pretrain_task,
     refuse_options,
     show_learnt,
-    with_usual_layers,
+    with_usual,
 )
 from qsgm.cli.streams import complain
 from qsgm.errors import QsgmError, as_text
@@ -232,7 +232,7 @@ def finetune(
     blocks: BlocksOption = None,
     trunk: TrunkOption = None,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = defaults.EPOCHS,
+    epochs: LessonEpochsOption = None,
     recalibrate: RecalibrateOption = False,
     stream: StreamOption = False,
     seed: SeedOption = 0,
@@ -266,8 +266,7 @@ def finetune(
     if is_of_samples(opened, task):
         refuse_options(center=bool(center), span=span is not None, **{"not": bool(others)})
         own = bundles_task(opened, task)
-        if layers is None and blocks is None:
-            settings = with_usual_layers(opened, own, settings)
+        settings = with_usual(opened, own, settings, layers=layers or blocks, epochs=epochs)
         learnt = learn_task(own, frames, opened, settings)
         learnt.save(folder, name)
         _remember(folder, chosen=output is not None)
@@ -345,7 +344,7 @@ def fidelity(
     ] = None,
     trunk: TrunkOption = None,
     optimizer: OptimizerOption = None,
-    epochs: EpochsOption = defaults.EPOCHS,
+    epochs: LessonEpochsOption = None,
     seed: SeedOption = 0,
     center: CenterOption = None,
     bundle: BundleOption = None,
@@ -377,7 +376,7 @@ def fidelity(
     if is_of_samples(opened, task):
         refuse_options(center=center is not None)
         own = bundles_task(opened, task)
-        settings = with_usual_layers(opened, own, settings) if layers is None else settings
+        settings = with_usual(opened, own, settings, layers=layers, epochs=epochs)
         if settings.layers == 1:
             raise QsgmError("one layer has no SGM, so there is nothing to compare; pass --layers 2")
         result = learn_task(own, [frame], opened, settings)

@@ -164,6 +164,15 @@ OptimizerOption = Annotated[
     OptimizerChoice | None, typer.Option(help="Default: the one found best for the method.")
 ]
 EpochsOption = Annotated[int, typer.Option(min=0, max=10_000, help="Passes over 800 crops.")]
+LessonEpochsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=10_000,
+        help="Passes over 800 crops.",
+        show_default=f"{defaults.EPOCHS}; over samples of one's own {defaults.SAMPLE_EPOCHS}",
+    ),
+]
 SeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="Of everything drawn at random.")
 ]
@@ -188,7 +197,7 @@ def settings_of(
     method: MethodName = MethodName.SGM,
     layers: int = defaults.LAYERS,
     optimizer: OptimizerChoice | None = None,
-    epochs: int = defaults.EPOCHS,
+    epochs: int | None = None,
     seed: int = 0,
     threads: int = 1,
     blocks: str | None = None,
@@ -206,7 +215,7 @@ def settings_of(
         blocks=blocks,
         trunk=None if trunk is None else trunk.value,
         optimizer=None if optimizer is None else optimizer.value,
-        epochs=epochs,
+        epochs=defaults.EPOCHS if epochs is None else epochs,
         seed=seed,
         threads=threads,
     )

@@ -88,11 +88,15 @@ def bundles_task(bundle: "Bundle", file: Path | None) -> "SampleTask":
     return task_of_bundle(bundle, _device_task(file))
 
 
-def with_usual_layers(bundle: "Bundle", task: "SampleTask", settings: "Settings") -> "Settings":
-    """Settings with as many layers as the task says."""
+def with_usual(
+    bundle: "Bundle", task: "SampleTask", settings: "Settings", **said: object
+) -> "Settings":
+    """Settings as they are usual for samples, where what was said of one, by its name, is None."""
     from qsgm.samples.teach import usual_settings
 
-    return usual_settings(bundle, task, settings)
+    usual = usual_settings(bundle, task)
+    left_open = [name for name, value in said.items() if value is None]
+    return replace(settings, **{name: getattr(usual, name) for name in left_open})
 
 
 def learn_task(

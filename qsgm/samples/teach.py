@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from qsgm import __version__
+from qsgm import __version__, defaults
 from qsgm.bundle import Bundle
 from qsgm.progress import Progress
 from qsgm.samples.lesson import Samples, checked_samples, fallen
@@ -75,7 +75,7 @@ def learn(
         shown: labelled samples.
         bundle: whose network is tuned.
         task: the bundle's; None: `arrays`, which is built in.
-        settings: how; None: in float, as many layers as the task says.
+        settings: how; None: :func:`usual_settings`.
         watch: told about progress.
 
     Raises:
@@ -92,7 +92,7 @@ def learn(
     return SamplesResult(**{one.name: getattr(result, one.name) for one in fields(result)})
 
 
-def usual_settings(bundle: Bundle, task: SampleTask, settings: Settings | None = None) -> Settings:
-    """Settings with as many layers as the task says, and the bundle can do."""
+def usual_settings(bundle: Bundle, task: SampleTask) -> Settings:
+    """In float, as many layers as the task says and the bundle can do, epochs as for samples."""
     layers = min(task.tuned, bundle.manifest.most_layers)
-    return replace(settings or Settings(), layers=layers)
+    return Settings(layers=layers, epochs=defaults.SAMPLE_EPOCHS)

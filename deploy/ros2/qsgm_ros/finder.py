@@ -36,7 +36,7 @@ class Options:
     objects: Sequence[str] = ()  # names or folders of objects taught before
     teach_as: str = "object"  # what the next object is called
     int8: bool = True
-    epochs: int = 20
+    epochs: int = 10
     threads: int = 1
     every_instance: bool = False
     any_distance: bool = False
