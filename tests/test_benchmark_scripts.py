@@ -16,6 +16,8 @@ import pytest
 import torch
 from toys import lay, table, toy
 
+from qsgm import Settings, finetune
+from qsgm.bench.frames import list_frames
 from qsgm.bundle import Bundle
 from qsgm.grasp.task import GraspTask
 from qsgm.images import read_demonstration
@@ -83,6 +85,19 @@ def test_layers_are_compared_division_by_division(
         mean = np.mean(row["per_frame"], axis=0)
         assert row["detection_accuracy"] == pytest.approx(mean[0], abs=1e-3)
         assert row["angle_mae_deg"] == pytest.approx(mean[1], abs=1e-3)
+
+
+def test_a_run_in_which_nothing_sits_out_is_the_usual_one(
+    frames_folder: Path, bundle: Bundle, bundle_folder: Path, tmp_path: Path
+) -> None:
+    asked = ("--frames", frames_folder, "--bundle", bundle_folder, "--epochs", 2, "--limit", 1)
+    printed, values = told(tmp_path, "sitting_out.py", *asked)
+    assert "backpropagation, 2 epochs, half sits out" in printed
+    frame = read_demonstration(list_frames(frames_folder, 1)[0].path)
+    usual = finetune(frame, bundle, Settings(epochs=2)).scores
+    shown = {name: usual[name] for name in ("detection_accuracy", "angle_mae_deg")}
+    assert values["SGMs, 2 epochs, all"] == pytest.approx(shown, abs=1e-4)
+    assert values["SGMs, 2 epochs, half sits out"] != values["SGMs, 2 epochs, all"]
 
 
 def test_every_baseline_runs(frames_folder: Path, tmp_path: Path) -> None:
