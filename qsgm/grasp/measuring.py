@@ -8,8 +8,8 @@ it is cut out of the whole frame.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise, zip_longest
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import sqrt
 
 import cv2
@@ -58,13 +58,15 @@ def measured_span(frame: Frame, center_px: Point) -> float | None:
 
     None where no two sizes of the frame agree on it.
     """
-    spans = _spans(frame, center_px)
-    agreed = _agreed(spans) or _span_of_large(frame, center_px)
-    if agreed is None:
-        agreed = _span_between(frame, center_px, spans)
-    if agreed is not None and agreed < LEAST_SPAN_PX:
-        return _span_of_small(frame, center_px, agreed)
-    return agreed
+    cuts = _cuts(frame, center_px)
+    span = _agreed(cuts) or _best_in_middle(
+        [*filter(None, cuts), *_cuts_of_whole(frame, center_px)]
+    )
+    if span is None:
+        span = _span_between(frame, center_px)
+    if span is not None and span < LEAST_SPAN_PX:
+        return _span_of_small(frame, center_px, span)
+    return span
 
 
 def scale_for(span_px: float | None, frame_hw: tuple[int, int]) -> float:
@@ -112,62 +114,74 @@ def moved_point(point_px: Point, source_hw: tuple[int, int], target_hw: tuple[in
     return x, y
 
 
-def _spans(frame: Frame, center_px: Point) -> list[float | None]:
-    """The span [px of the frame] in each halving, from the frame itself on; None: no good cut."""
-    spans: list[float | None] = []
-    halved, times = frame, 1
-    while min(halved.shape[:2]) >= _LEAST_HALVED_PX:
-        span = _span(halved, moved_point(center_px, frame.shape[:2], halved.shape[:2]))
-        spans.append(None if span is None else span * times)
-        if (_agreed(spans) or 0.0) >= _LARGE_SHARE * min(frame.shape[:2]):
-            break
-        halved, times = scaled_frame(halved, 0.5), 2 * times
-    return spans
-
-
 @dataclass(frozen=True)
 class _Cut:
-    """What may be the object, in the whole frame made small."""
+    """What may be the object."""
 
-    span_px: float
-    wide_px: float  # its shorter side
+    span_px: float  # of the frame
     off_middle: float  # how far from where the object was shown, of its span
-    edge: float  # the image's gradient along it, over that elsewhere
 
 
-def _span_of_large(frame: Frame, center_px: Point) -> float | None:
-    """The span of an object that takes up much of its frame, by cuts of all of it.
+def _best_in_middle(cuts: Sequence[_Cut]) -> float | None:
+    """The span of that cut which lies best in the middle of what was shown.
 
-    How far it reaches is not known, nor whether it is seen in one piece. Of several cuts that one
-    counts which lies best in the middle of what was shown: a part of the object hardly ever does.
-    What reaches from border to border counts as large as its frame.
+    A part of the object hardly ever does, nor does the object with something else.
+    """
+    best = min(cuts, key=lambda cut: cut.off_middle, default=None)
+    return None if best is None else best.span_px
+
+
+def _cuts(frame: Frame, center_px: Point) -> list[_Cut | None]:
+    """The cut in each halving, from the frame itself on; None: no good one."""
+    cuts: list[_Cut | None] = []
+    halved, times = frame, 1
+    while min(halved.shape[:2]) >= _LEAST_HALVED_PX:
+        cut = _cut(halved, moved_point(center_px, frame.shape[:2], halved.shape[:2]))
+        cuts.append(None if cut is None else replace(cut, span_px=cut.span_px * times))
+        if (_agreed(cuts) or 0.0) >= _LARGE_SHARE * min(frame.shape[:2]):
+            break
+        halved, times = scaled_frame(halved, 0.5), 2 * times
+    return cuts
+
+
+def _cuts_of_whole(frame: Frame, center_px: Point) -> list[_Cut]:
+    """Cuts of an object that takes up much of its frame, out of all of it.
+
+    How far it reaches is not known, nor whether it is seen in one piece. What reaches from border
+    to border counts as large as its frame.
     """
     shorter, longer = sorted(frame.shape[:2])
     small = scaled_frame(frame, _WHOLE_PX / shorter)
     middle = moved_point(center_px, frame.shape[:2], small.shape[:2])
-    cuts = [cut for reach in _REACHES for cut in _cuts_of_whole(small, middle, reach)]
-    least = _LEAST_WHOLE_SHARE * _WHOLE_PX
-    sound = [cut for cut in cuts if cut.span_px >= least and cut.edge >= _LEAST_EDGE]
-    best = min(sound, key=lambda cut: cut.off_middle, default=None)
-    if best is None:
-        return None
-    fills = best.wide_px > _WHOLE_PX - 2 * _RIM_PX - 2
-    return float(longer) if fills else best.span_px * shorter / _WHOLE_PX
+    slope, cuts = _slope(small), list[_Cut]()
+    for reach in _REACHES:
+        for pixels, handicap in _found_in_whole(small, middle, reach):
+            (y, x), size, _ = cv2.minAreaRect(np.argwhere(pixels).astype(np.float32))
+            wide, span = sorted(size)
+            if span < _LEAST_WHOLE_SHARE * _WHOLE_PX or _sharpness(pixels, slope) < _LEAST_EDGE:
+                continue
+            off = float(np.hypot(x - middle[0], y - middle[1])) / span
+            fills = wide > _WHOLE_PX - 2 * _RIM_PX - 2
+            span_px = float(longer) if fills else span * shorter / _WHOLE_PX
+            cuts.append(_Cut(span_px, off + handicap))
+    return cuts
 
 
-def _cuts_of_whole(small: Frame, middle: Point, reach: float) -> Iterator[_Cut]:
-    """What lies in the middle, then all that does not reach the border, if it is in parts."""
+def _found_in_whole(
+    small: Frame, middle: Point, reach: float
+) -> Iterator[tuple[NDArray[np.bool_], float]]:
+    """What lies in the middle, then all parts that do not reach the border, with a handicap."""
     down, right = np.ogrid[: small.shape[0], : small.shape[1]]
     away = np.hypot(right - middle[0], down - middle[1])
     inner = np.zeros(small.shape[:2], np.bool_)
     inner[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
     trimap = np.where(inner, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
     trimap[inner & (away < reach * _WHOLE_PX)] = cv2.GC_PR_FGD
-    found, slope = cut_out(small, trimap), _slope(small)
+    found = cut_out(small, trimap)
     count, parts, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
     in_middle = parts[found & (away < _SURE_SHARE * _WHOLE_PX)]
     if in_middle.size:
-        yield _cut_of(parts == np.bincount(in_middle).argmax(), middle, slope)
+        yield parts == np.bincount(in_middle).argmax(), 0.0
     outermost = set(parts[_edge(inner)].tolist())
     whole = [
         part
@@ -175,18 +189,15 @@ def _cuts_of_whole(small: Frame, middle: Point, reach: float) -> Iterator[_Cut]:
         if sizes[part, cv2.CC_STAT_AREA] >= _LEAST_PART_PX and part not in outermost
     ]
     if whole:
-        yield _cut_of(np.isin(parts, whole), middle, slope, _IN_PARTS)
+        yield np.isin(parts, whole), _IN_PARTS
 
 
-def _cut_of(
-    pixels: NDArray[np.bool_], middle: Point, slope: NDArray[np.uint8], handicap: float = 0.0
-) -> _Cut:
-    (y, x), size, _ = cv2.minAreaRect(np.argwhere(pixels).astype(np.float32))
-    (wide, span), edge = sorted(size), _edge(pixels)
-    near = cv2.dilate(edge.astype(np.uint8), _AROUND) > 0
-    elsewhere = 1.0 + float(np.median(slope[~near])) if not near.all() else np.inf
-    off = float(np.hypot(x - middle[0], y - middle[1])) / max(span, 1.0) + handicap
-    return _Cut(span, wide, off, float(np.median(slope[edge])) / elsewhere)
+def _sharpness(pixels: NDArray[np.bool_], slope: NDArray[np.uint8]) -> float:
+    """The image's gradient along the edge of some pixels, over that elsewhere."""
+    edge = _edge(pixels)
+    away = cv2.dilate(edge.astype(np.uint8), _AROUND) == 0
+    elsewhere = float(np.median(slope[away])) if away.any() else np.inf
+    return float(np.median(slope[edge])) / (1.0 + elsewhere)
 
 
 def _slope(image: Frame) -> NDArray[np.uint8]:
@@ -199,16 +210,12 @@ def _edge(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(pixels & (cv2.erode(pixels.astype(np.uint8), _NEXT) == 0))
 
 
-def _span_between(frame: Frame, center_px: Point, spans: Sequence[float | None]) -> float | None:
+def _span_between(frame: Frame, center_px: Point) -> float | None:
     """Between the halvings, where an object may be that is too large in one, too small in two."""
     between = scaled_frame(frame, sqrt(0.5))
-    middle = moved_point(center_px, frame.shape[:2], between.shape[:2])
-    others = [span and span * sqrt(2) for span in _spans(between, middle)]
-    mixed = [span for both in zip_longest(spans, others) for span in both]
-    guess = max((span for span in mixed if span), default=None)
-    if guess is not None and guess > _LARGEST_GUESS * min(frame.shape[:2]):
-        guess = None
-    return _agreed(mixed) or guess
+    cuts = _cuts(between, moved_point(center_px, frame.shape[:2], between.shape[:2]))
+    guess = max((cut.span_px * sqrt(2) for cut in cuts if cut), default=None)
+    return guess if guess and guess <= _LARGEST_GUESS * min(frame.shape[:2]) else None
 
 
 def _span_of_small(frame: Frame, center_px: Point, span_px: float) -> float | None:
@@ -216,20 +223,26 @@ def _span_of_small(frame: Frame, center_px: Point, span_px: float) -> float | No
     left, top = (round(value) - PATCH_PX // 2 for value in center_px)
     doubled = scaled_frame(mirrored_square(frame, left, top, PATCH_PX), 2.0)
     middle = (PATCH_PX - 0.5, PATCH_PX - 0.5)
-    large = _span(doubled, middle)
-    return _agreed([None if large is None else large / 2, span_px])
+    large = _cut(doubled, middle)
+    return large.span_px / 2 if large and _same(large.span_px / 2, span_px) else None
 
 
-def _span(frame: Frame, center_px: Point) -> float | None:
+def _cut(frame: Frame, center_px: Point) -> _Cut | None:
     patch = cut_patch(frame, center_px)
     if not patch.cut_out or patch.radius_px > LARGEST_RADIUS_PX - _TOUCHING_PX:
         return None
-    long_px, _ = patch.span_px
-    return long_px if long_px >= _LEAST_CUT_PX else None
+    (x, y), size, _ = cv2.minAreaRect(cv2.findNonZero(patch.mask))
+    if max(size) < _LEAST_CUT_PX:
+        return None
+    off = float(np.hypot(x - patch.center_px[0], y - patch.center_px[1]))
+    return _Cut(float(max(size)), off / max(size))
 
 
-def _agreed(spans: Sequence[float | None]) -> float | None:
+def _agreed(cuts: Sequence[_Cut | None]) -> float | None:
     """The largest span on which two neighbouring halvings agree."""
-    pairs = [(a, b) for a, b in pairwise(spans) if a and b]
-    same = [a for a, b in pairs if max(a, b) <= _SAME_SPAN * min(a, b)]
-    return max(same, default=None)
+    pairs = [(a.span_px, b.span_px) for a, b in pairwise(cuts) if a and b]
+    return max((a for a, b in pairs if _same(a, b)), default=None)
+
+
+def _same(one_px: float, other_px: float) -> bool:
+    return max(one_px, other_px) <= _SAME_SPAN * min(one_px, other_px)

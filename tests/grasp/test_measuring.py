@@ -11,7 +11,8 @@ from toys import lay, table, toy
 from qsgm import QsgmError
 from qsgm.bench.subjects import drawn_subjects
 from qsgm.grasp.measuring import (
-    _span_of_large,
+    _best_in_middle,
+    _cuts_of_whole,
     measured_span,
     moved_point,
     scale_for,
@@ -54,16 +55,18 @@ def test_an_object_that_nearly_fills_its_frame_is_measured(
 
 def test_a_cut_of_the_whole_frame_measures_what_spans_a_fifth_of_it_and_more() -> None:
     for scale in (1.2, 1.6, 2.0, 3.4):
-        assert _span_of_large(*shown(scale)) == pytest.approx(90 * scale, rel=0.1)
+        span = _best_in_middle(_cuts_of_whole(*shown(scale)))
+        assert span == pytest.approx(90 * scale, rel=0.1)
     for scale in (0.6, 0.9):
-        assert _span_of_large(*shown(scale)) is None
+        assert _cuts_of_whole(*shown(scale)) == []
 
 
 def test_a_larger_thing_close_by_is_not_what_lies_at_the_centre() -> None:
     frame = table(1)
     cv2.rectangle(frame, (255, 232), (385, 248), (30, 30, 200), cv2.FILLED)
     cv2.rectangle(frame, (190, 282), (450, 382), (30, 30, 200), cv2.FILLED)
-    assert _span_of_large(frame, (320.0, 240.0)) == pytest.approx(130, rel=0.1)
+    span = _best_in_middle(_cuts_of_whole(frame, (320.0, 240.0)))
+    assert span == pytest.approx(130, rel=0.1)
 
 
 @pytest.mark.parametrize("turn_deg", [0, 50])
