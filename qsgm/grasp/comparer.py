@@ -54,11 +54,28 @@ class Comparer:
     output: Layer
 
     def logits(self, cells: Cells, seen: NDArray[np.uint8]) -> Floats:
-        """Log odds (N,) of what is seen (N, 64, 64, 3) being the object."""
-        x = side_by_side(cells, seen)
+        """Log odds (N,) of what is seen (N, 64, 64, 3) being the object, at a glance."""
+        return self._logits(side_by_side(cells, seen), _coarse(cells))
+
+    def logits_all_ways(self, cells: Cells, seen: NDArray[np.uint8]) -> Floats:
+        """Mean log odds (N,) by pictures laid in all eight ways: turned by quarters, mirrored.
+
+        It learnt on all of them, and errs differently in each.
+        """
+        x, share = side_by_side(cells, seen), _coarse(cells)
+        ways = [
+            self._logits(np.rot90(some, quarters, (1, 2)), np.rot90(its, quarters))
+            for some, its in ((x, share), (x[:, :, ::-1], share[:, ::-1]))
+            for quarters in range(4)
+        ]
+        return np.asarray(np.mean(ways, axis=0), np.float32)
+
+    def _logits(self, pictures: Floats, share: Floats) -> Floats:
+        """Log odds (N,) by pictures (N, 64, 64, 10), and the object's share of the last maps."""
+        x = pictures
         for layer, stride in zip(self.convolutions, STRIDES, strict=True):
             x = np.maximum(_windows(x, stride) @ layer.weight + layer.bias, np.float32(0))
-        x = np.maximum(_summed_up(x, cells) @ self.hidden.weight + self.hidden.bias, np.float32(0))
+        x = np.maximum(_summed_up(x, share) @ self.hidden.weight + self.hidden.bias, np.float32(0))
         return np.asarray((x @ self.output.weight + self.output.bias)[:, 0], np.float32)
 
     @property
@@ -161,11 +178,15 @@ def _windows(maps: Floats, stride: int) -> Floats:
     return np.concatenate(taps, axis=-1)
 
 
-def _summed_up(maps: Floats, cells: Cells) -> Floats:
-    """Mean over the object, largest and mean (N, 3 C) of the last maps (N, 8, 8, C)."""
+def _coarse(cells: Cells) -> Floats:
+    """What each pixel of the last maps has of the object (8, 8); sums to 1."""
     each = SIDE // LAST_SIDE
     coarse = cells.solid.reshape(LAST_SIDE, each, LAST_SIDE, each).mean(axis=(1, 3))
-    share = np.asarray(coarse / (coarse.sum() + np.float32(_TINY)), np.float32)
+    return np.asarray(coarse / (coarse.sum() + np.float32(_TINY)), np.float32)
+
+
+def _summed_up(maps: Floats, share: Floats) -> Floats:
+    """Mean over the object, largest and mean (N, 3 C) of the last maps (N, 8, 8, C)."""
     inside = (maps * share[..., None]).sum(axis=(1, 2))
     return np.concatenate([inside, maps.max(axis=(1, 2)), maps.mean(axis=(1, 2))], axis=1)
 

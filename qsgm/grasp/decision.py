@@ -21,6 +21,8 @@ Floats = NDArray[np.float32]
 # Of drawn scenes without the object. In photographs some four times as many are raised.
 FALSE_ALARM_RATE = 0.005
 MOST_HIDDEN = 256
+# Odds this close to the threshold are worth eight looks instead of one.
+_CLOSE = 3.0
 # What the comparer says, behind all other evidence.
 COMPARED = "compared"
 
@@ -48,7 +50,13 @@ class Decision:
             evidence: (N, F), as :func:`qsgm.grasp.evidence.evidence` has it.
             seen: (N, 64, 64, 3), what lies there, moved and turned as it was taught.
         """
-        return self.quality(with_comparison(self.comparer, cells, evidence, seen))
+        if self.comparer is None:
+            return self.quality(evidence)
+        facts = np.column_stack([evidence, self.comparer.logits(cells, seen)])
+        close = np.abs(self.score(facts) - self.threshold) < _CLOSE
+        if close.any():
+            facts[close, -1] = self.comparer.logits_all_ways(cells, seen[close])
+        return self.quality(facts)
 
     def score(self, evidence: Floats) -> NDArray[np.float64]:
         """Log odds of evidence (..., F) coming from the object, before the threshold: (...)."""
@@ -116,7 +124,7 @@ def with_comparison(
     """Evidence (N, F), and behind it what a comparer says (N, F + 1), where there is one."""
     if comparer is None:
         return evidence
-    return np.column_stack([evidence, comparer.logits(cells, seen)])
+    return np.column_stack([evidence, comparer.logits_all_ways(cells, seen)])
 
 
 def _names(compares: bool) -> list[str]:
