@@ -17,6 +17,8 @@ from qsgm import QsgmError
 from qsgm.grasp.cells import Cells
 from qsgm.grasp.comparer import INPUTS, STRIDES, Comparer, Layer, side_by_side
 from qsgm.grasp.correlation import Template
+from qsgm.grasp.decision import Decision
+from qsgm.grasp.evidence import NAMES
 from qsgm.grasp.patch import cut_patch
 
 CENTER = (320.0, 240.0)
@@ -74,6 +76,38 @@ def test_logits_are_those_of_convolutions_written_out() -> None:
     comparer, seen = random_comparer(), views(2)
     expected = [by_loops(comparer, CELLS, one) for one in seen]
     assert comparer.logits(CELLS, seen) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_all_ways_are_the_mean_of_eight_comparisons() -> None:
+    comparer, seen = random_comparer(), views(2)
+    expected = np.zeros(2)
+    for mirrored in (False, True):
+        for quarters in range(4):
+
+            def laid(picture: Any, quarters: int = quarters, mirrored: bool = mirrored) -> Any:
+                return np.rot90(picture[:, ::-1] if mirrored else picture, quarters)
+
+            cells = replace(CELLS, image=laid(CELLS.image), solid=laid(CELLS.solid))
+            expected += [by_loops(comparer, cells, laid(one)) / 8 for one in seen]
+    assert comparer.logits_all_ways(CELLS, seen) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_only_what_is_close_to_the_threshold_is_compared_in_all_ways() -> None:
+    comparer, seen = random_comparer(), views(3)
+    glance, all_ways = comparer.logits(CELLS, seen), comparer.logits_all_ways(CELLS, seen)
+    assert np.abs(glance - all_ways).min() > 1e-3
+    count = len(NAMES) + 1
+    says_what_the_comparer_says = np.zeros((2, count), np.float32)
+    says_what_the_comparer_says[:, -1] = 1, -1
+    for far in (False, True):
+        threshold = float(glance[0]) + (10.0 if far else 0.0)
+        decision = Decision(
+            np.zeros(count, np.float32), np.ones(count, np.float32), says_what_the_comparer_says,
+            np.zeros(2, np.float32), np.array([1, -1], np.float32), 0.0, threshold, comparer,
+        )  # fmt: skip
+        (quality,) = decision.judged(CELLS, np.zeros((1, len(NAMES)), np.float32), seen[:1])
+        odds = float((glance if far else all_ways)[0]) - threshold
+        assert quality == pytest.approx(1 / (1 + math.exp(-odds)), rel=1e-4)
 
 
 def test_each_view_is_compared_by_itself() -> None:
