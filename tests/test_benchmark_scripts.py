@@ -36,6 +36,13 @@ def told(tmp_path: Path, script: str, *arguments: object) -> tuple[str, Any]:
     return done.stdout, json.loads(path.read_text())
 
 
+def test_sizes_of_drawn_objects_are_measured_at_every_share(tmp_path: Path) -> None:
+    _, found = told(tmp_path, "spans.py", "--objects", 2)
+    assert list(found) == [f"drawn, {share}%" for share in (10, 20, 35, 50, 70, 85)]
+    assert all(count == 2 for _, count in found.values())
+    assert sum(right for right, _ in found.values()) >= 9
+
+
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
     """Two objects, each photographed twice, and something else."""
