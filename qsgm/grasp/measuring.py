@@ -44,6 +44,9 @@ _WHOLE_PX, _REACHES, _SURE_SHARE, _LEAST_WHOLE_SHARE = 96, (0.3, 0.5, 0.65), 0.1
 # What lies in several parts has to lie that much better in the middle, of its span, than one part.
 _IN_PARTS = 0.08
 _LEAST_PART_PX = 12
+# What is as large as its frame lies in the middle whatever it is, and has to be so much better;
+# of what lies there as well, to so much, the largest counts.
+_AS_LARGE_AS_FRAME, _AS_WELL = 0.1, 0.01
 # The image's gradient along the edge of an object, over what it is elsewhere: light on a cloth ends
 # gradually.
 _LEAST_EDGE = 1.3
@@ -59,9 +62,10 @@ def measured_span(frame: Frame, center_px: Point) -> float | None:
     None where no two sizes of the frame agree on it.
     """
     cuts = _cuts(frame, center_px)
-    span = _agreed(cuts) or _best_in_middle(
-        [*filter(None, cuts), *_cuts_of_whole(frame, center_px)]
-    )
+    span = _agreed(cuts)
+    if span is None:
+        every = [*filter(None, cuts), *_cuts_of_whole(frame, center_px)]
+        span = _best_in_middle(every, min(frame.shape[:2]))
     if span is None:
         span = _span_between(frame, center_px)
     if span is not None and span < LEAST_SPAN_PX:
@@ -122,13 +126,22 @@ class _Cut:
     off_middle: float  # how far from where the object was shown, of its span
 
 
-def _best_in_middle(cuts: Sequence[_Cut]) -> float | None:
+def _best_in_middle(cuts: Sequence[_Cut], shorter_px: int) -> float | None:
     """The span of that cut which lies best in the middle of what was shown.
 
     A part of the object hardly ever does, nor does the object with something else.
+
+    Args:
+        cuts: of a frame.
+        shorter_px: its shorter side.
     """
-    best = min(cuts, key=lambda cut: cut.off_middle, default=None)
-    return None if best is None else best.span_px
+
+    def off_middle(cut: _Cut) -> float:
+        return cut.off_middle + _AS_LARGE_AS_FRAME * (cut.span_px / shorter_px) ** 12
+
+    least = min(map(off_middle, cuts), default=0.0)
+    best = [cut.span_px for cut in cuts if off_middle(cut) <= least + _AS_WELL]
+    return max(best, default=None)
 
 
 def _cuts(frame: Frame, center_px: Point) -> list[_Cut | None]:

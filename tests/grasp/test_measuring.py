@@ -55,7 +55,7 @@ def test_an_object_that_nearly_fills_its_frame_is_measured(
 
 def test_a_cut_of_the_whole_frame_measures_what_spans_a_fifth_of_it_and_more() -> None:
     for scale in (1.2, 1.6, 2.0, 3.4):
-        span = _best_in_middle(_cuts_of_whole(*shown(scale)))
+        span = _best_in_middle(_cuts_of_whole(*shown(scale)), 480)
         assert span == pytest.approx(90 * scale, rel=0.1)
     for scale in (0.6, 0.9):
         assert _cuts_of_whole(*shown(scale)) == []
@@ -65,7 +65,7 @@ def test_a_larger_thing_close_by_is_not_what_lies_at_the_centre() -> None:
     frame = table(1)
     cv2.rectangle(frame, (255, 232), (385, 248), (30, 30, 200), cv2.FILLED)
     cv2.rectangle(frame, (190, 282), (450, 382), (30, 30, 200), cv2.FILLED)
-    span = _best_in_middle(_cuts_of_whole(frame, (320.0, 240.0)))
+    span = _best_in_middle(_cuts_of_whole(frame, (320.0, 240.0)), 480)
     assert span == pytest.approx(130, rel=0.1)
 
 
@@ -88,6 +88,12 @@ def test_a_large_object_in_two_parts_is_measured_as_one() -> None:
     for side in (-1, 1):
         cv2.ellipse(frame, (320 + side * 105, 240), (80, 55), 0, 0, 360, (30, 25, 25), cv2.FILLED)
     assert measured_span(frame, center) == pytest.approx(370, rel=0.1)
+
+
+def test_what_fills_the_frame_is_not_the_object_only_because_it_lies_in_its_middle() -> None:
+    frame, center = shown(1.0)
+    frame[:, :40], frame[:, -40:], frame[:20], frame[-20:] = 40, 40, 40, 40
+    assert measured_span(frame, center) == pytest.approx(90, rel=0.1)
 
 
 def test_a_table_that_looks_like_a_large_thing_is_not_taken_for_one() -> None:
