@@ -3,8 +3,8 @@
 The network looks at windows of 128 px, in which an object should span 60 to 110. A photograph does
 not say how large its object is: so it is halved again and again, and cut out of every halving. A
 cut that is right gives the same span in two of them; one that is a part of the object, or table
-with it, hardly ever does. An object that is large in its frame has too little around it for that:
-it is cut out of the whole frame.
+with it, hardly ever does. Where no two agree, as of an object that is large in its frame, it is
+cut out of the whole frame, too, and of all cuts that counts which lies best where it was shown.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,7 +59,7 @@ _NEXT, _AROUND = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
 def measured_span(frame: Frame, center_px: Point) -> float | None:
     """Long side [px] of the object at `center_px` (x, y) in a frame (H, W, 3) BGR.
 
-    None where no two sizes of the frame agree on it.
+    None where nothing can be cut out that is neither too small nor too large.
     """
     cuts = _cuts(frame, center_px)
     span = _agreed(cuts)
