@@ -41,6 +41,8 @@ _LEAST_CUT_PX = 18.0
 # Cut out of the whole frame: its shorter side then, and as shares of it how far from the centre the
 # object may reach, where it surely is, and what it spans at least.
 _WHOLE_PX, _REACHES, _SURE_SHARE, _LEAST_WHOLE_SHARE = 96, (0.3, 0.5, 0.65), 0.12, 0.2
+# Of a long narrow frame so many times its shorter side on each side of the centre are looked at.
+_MOST_WHOLE = 2
 # What lies in several parts has to lie that much better in the middle, of its span, than one part.
 _IN_PARTS = 0.08
 _LEAST_PART_PX = 12
@@ -164,8 +166,10 @@ def _cuts_of_whole(frame: Frame, center_px: Point) -> list[_Cut]:
     to border counts as large as its frame.
     """
     shorter, longer = sorted(frame.shape[:2])
-    small = scaled_frame(frame, _WHOLE_PX / shorter)
-    middle = moved_point(center_px, frame.shape[:2], small.shape[:2])
+    left, top = (max(round(value) - _MOST_WHOLE * shorter, 0) for value in center_px)
+    near = frame[top : top + 2 * _MOST_WHOLE * shorter, left : left + 2 * _MOST_WHOLE * shorter]
+    small = scaled_frame(near, _WHOLE_PX / shorter)
+    middle = moved_point((center_px[0] - left, center_px[1] - top), near.shape[:2], small.shape[:2])
     slope, cuts = _slope(small), list[_Cut]()
     for reach in _REACHES:
         for pixels, handicap in _found_in_whole(small, middle, reach):

@@ -10,6 +10,7 @@ from toys import lay, table, toy
 
 from qsgm import QsgmError
 from qsgm.bench.subjects import drawn_subjects
+from qsgm.grasp import measuring
 from qsgm.grasp.measuring import (
     _best_in_middle,
     _cuts_of_whole,
@@ -88,6 +89,22 @@ def test_a_large_object_in_two_parts_is_measured_as_one() -> None:
     for side in (-1, 1):
         cv2.ellipse(frame, (320 + side * 105, 240), (80, 55), 0, 0, 360, (30, 25, 25), cv2.FILLED)
     assert measured_span(frame, center) == pytest.approx(370, rel=0.1)
+
+
+def test_of_a_long_narrow_frame_only_what_is_near_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it would take half a minute."""
+    pixels, cut_out = list[int](), measuring.cut_out
+
+    def counted(image: Any, trimap: Any) -> Any:
+        pixels.append(trimap.size)
+        return cut_out(image, trimap)
+
+    monkeypatch.setattr(measuring, "cut_out", counted)
+    wide = table(1, (120, 4000))
+    found = _cuts_of_whole(lay(toy(), wide, (3000.0, 60.0)), (3000.0, 60.0))
+    assert [cut.span_px for cut in found] == pytest.approx([90] * len(found), rel=0.15)
+    assert found
+    assert max(pixels) <= 96 * 4 * 96
 
 
 def test_what_fills_the_frame_is_not_the_object_only_because_it_lies_in_its_middle() -> None:
