@@ -20,6 +20,7 @@ from qsgm.tune.settings import Settings
 
 
 def run_scenes(
+    *,
     frames: Path | None,
     limit: int | None,
     conditions: Sequence[str],

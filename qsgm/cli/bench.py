@@ -154,7 +154,16 @@ def bench_scenes(
     loaded, asked = open_bundle(bundle), conditions or [*SceneCondition]
     with progress() as watch:
         values = run_scenes(
-            frames, limit, asked, scenes, settings, loaded, others, keep, output, watch
+            frames=frames,
+            limit=limit,
+            conditions=asked,
+            count=scenes,
+            settings=settings,
+            bundle=loaded,
+            rivals=others,
+            keep=keep,
+            output=output,
+            watch=watch,
         )
     show(values, render(values), as_json)
 

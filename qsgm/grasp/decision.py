@@ -18,7 +18,7 @@ from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.evidence import NAMES
 
 Floats = NDArray[np.float32]
-# Of drawn scenes without the object. In photographs some four times as many are raised.
+# Of drawn scenes without the object. In photographs up to four times as many were raised.
 FALSE_ALARM_RATE = 0.005
 MOST_HIDDEN = 256
 # Odds this close to the threshold are worth eight looks instead of one.
@@ -48,7 +48,8 @@ class Decision:
         Args:
             cells: of the taught object.
             evidence: (N, F), as :func:`qsgm.grasp.evidence.evidence` has it.
-            seen: (N, 64, 64, 3), what lies there, moved and turned as it was taught.
+            seen: (N, 64, 64, 3), what lies there, moved and turned as it was taught. What is close
+                to the threshold by a glance is compared in all eight ways.
         """
         if self.comparer is None:
             return self.quality(evidence)
@@ -116,15 +117,6 @@ class Decision:
             raise QsgmError(f"{where}: the decision's numbers do not fit; {_ADVICE}") from error
         _check(decision, where)
         return decision
-
-
-def with_comparison(
-    comparer: Comparer | None, cells: Cells, evidence: Floats, seen: NDArray[np.uint8]
-) -> Floats:
-    """Evidence (N, F), and behind it what a comparer says (N, F + 1), where there is one."""
-    if comparer is None:
-        return evidence
-    return np.column_stack([evidence, comparer.logits_all_ways(cells, seen)])
 
 
 def _names(compares: bool) -> list[str]:

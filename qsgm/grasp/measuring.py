@@ -10,7 +10,6 @@ cut out of the whole frame, too, and of all cuts that counts which lies best whe
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import sqrt
 
 import cv2
 import numpy as np
@@ -52,8 +51,6 @@ _AS_LARGE_AS_FRAME, _AS_WELL = 0.1, 0.01
 # The image's gradient along the edge of an object, over what it is elsewhere: light on a cloth ends
 # gradually.
 _LEAST_EDGE = 1.3
-# A span on which nothing agrees is a guess, and this share of the shorter side the largest.
-_LARGEST_GUESS = 0.5
 _RIM_PX = 2  # of the whole frame, made small: table, whatever it looks like
 _NEXT, _AROUND = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
 
@@ -68,8 +65,6 @@ def measured_span(frame: Frame, center_px: Point) -> float | None:
     if span is None:
         every = [*filter(None, cuts), *_cuts_of_whole(frame, center_px)]
         span = _best_in_middle(every, min(frame.shape[:2]))
-    if span is None:
-        span = _span_between(frame, center_px)
     if span is not None and span < LEAST_SPAN_PX:
         return _span_of_small(frame, center_px, span)
     return span
@@ -225,14 +220,6 @@ def _slope(image: Frame) -> NDArray[np.uint8]:
 def _edge(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The outermost of some pixels (h, w)."""
     return np.asarray(pixels & (cv2.erode(pixels.astype(np.uint8), _NEXT) == 0))
-
-
-def _span_between(frame: Frame, center_px: Point) -> float | None:
-    """Between the halvings, where an object may be that is too large in one, too small in two."""
-    between = scaled_frame(frame, sqrt(0.5))
-    cuts = _cuts(between, moved_point(center_px, frame.shape[:2], between.shape[:2]))
-    guess = max((cut.span_px * sqrt(2) for cut in cuts if cut), default=None)
-    return guess if guess and guess <= _LARGEST_GUESS * min(frame.shape[:2]) else None
 
 
 def _span_of_small(frame: Frame, center_px: Point, span_px: float) -> float | None:

@@ -13,6 +13,7 @@ from qsgm.bench.subjects import drawn_subjects
 from qsgm.grasp import measuring
 from qsgm.grasp.measuring import (
     _best_in_middle,
+    _Cut,
     _cuts_of_whole,
     measured_span,
     moved_point,
@@ -107,10 +108,20 @@ def test_of_a_long_narrow_frame_only_what_is_near_is_cut(monkeypatch: pytest.Mon
     assert max(pixels) <= 96 * 4 * 96
 
 
-def test_what_fills_the_frame_is_not_the_object_only_because_it_lies_in_its_middle() -> None:
-    frame, center = shown(1.0)
-    frame[:, :40], frame[:, -40:], frame[:20], frame[-20:] = 40, 40, 40, 40
-    assert measured_span(frame, center) == pytest.approx(90, rel=0.1)
+@pytest.mark.parametrize(
+    ("cuts", "span"),
+    [
+        ([(97, 0.028), (300, 0.007)], 300),
+        ([(97, 0.028), (450, 0.007)], 97),
+        ([(97, 0.08), (450, 0.007)], 450),
+        ([(201, 0.002), (376, 0.001)], 376),
+        ([], None),
+    ],
+)
+def test_what_fills_the_frame_is_not_the_object_only_because_it_lies_in_its_middle(
+    cuts: list[tuple[float, float]], span: float | None
+) -> None:
+    assert _best_in_middle([_Cut(*cut) for cut in cuts], 480) == span
 
 
 def test_a_table_that_looks_like_a_large_thing_is_not_taken_for_one() -> None:

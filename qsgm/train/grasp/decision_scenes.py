@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from qsgm.grasp.comparer import Comparer
-from qsgm.grasp.decision import with_comparison
 from qsgm.grasp.judge import Appearance, judge
 from qsgm.grasp.patch import cut_patch
 from qsgm.task import Heads
@@ -116,7 +115,9 @@ def _judge_all(
         evidence, seen = (
             np.stack([getattr(one, k) for one in found]) for k in ("evidence", "seen")
         )
-        facts = with_comparison(comparer, cells, evidence, seen)
+        facts = evidence
+        if comparer is not None:
+            facts = np.column_stack([evidence, comparer.logits_all_ways(cells, seen)])
         weighed = (Weighed(some, one.center_px) for some, one in zip(facts, found, strict=True))
         return JudgedScene(number, center_px, tuple(weighed))
 
