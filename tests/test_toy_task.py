@@ -102,6 +102,14 @@ def test_a_manifest_says_what_it_was_given(bundle: Bundle) -> None:
     assert again.blocks[:4] == ("4", "3,4", "2,3,4", "1,2,3,4")
 
 
+def test_its_model_card_speaks_of_no_other_task(bundle: Bundle) -> None:
+    card = (bundle.folder / "README.md").read_text()
+    assert f"for the task `{bundle.manifest.task.name}`" in card
+    assert f"`step_float_*_A-{bundle.network.depth}.onnx`" in card
+    for word in ("GraspNet", "distractors", "frame", "heatmap", "crop"):
+        assert word not in card.split("```json")[0]
+
+
 def test_the_network_in_onnx_answers_as_the_folded_one_in_torch(
     bundle: Bundle, checkpoint: Path, lesson: ToyLesson
 ) -> None:

@@ -8,8 +8,9 @@ distractors, others) and cuts them (pixels); `lesson` labels them. `taught` is w
 a verdict on it (likeness, verdict).
 
 Finding: `tuned` runs its network over a frame (heatmap, candidates). `finding` has every place
-judged: `judge` lays the patch there, coarse to fine (correlation, cells, alignment, snapping),
-collects evidence (evidence, outline, colours, comparer), which `decision` weighs.
+judged: `judge` lays the patch there, coarse to fine (correlation, cells, alignment), and
+by its edges (edges, outline, snapping); `decision` weighs how that fits and what the network says
+(evidence) and how alike the two look (comparer).
 
 What is said of both: report, sights (several objects), pictures, watch (frame after frame).
 """

@@ -70,11 +70,6 @@ class Cells:
         return Look(self, seen, moments)
 
     @cached_property
-    def texture(self) -> Floats:
-        """How much there is to agree on in each cell (C,), 0 to 1."""
-        return np.asarray(self.variance / (self.variance + NOISE_VARIANCE), dtype=np.float32)
-
-    @cached_property
     def noisy(self) -> Floats:
         """Variance (C,) with that of a flat surface's noise."""
         return np.asarray(self.variance + NOISE_VARIANCE, dtype=np.float32)

@@ -1,10 +1,9 @@
 """A small network that looks at the taught object and at what lies at a candidate, side by side.
 
-What :mod:`qsgm.grasp.evidence` lists sums a comparison up in numbers; where in the picture the two
-differ is lost in them. This one sees both pictures, moved and turned so that the object lies alike,
-and says how likely they show the same thing (a two-channel network, Zagoruyko and Komodakis 2015).
-It learnt that on drawn objects (:mod:`qsgm.train.grasp.comparer`) and learns nothing on the device:
-its answer is one more piece of evidence. 24,000 weights of 8 bits.
+Both pictures are moved and turned so that the object lies alike; the network says how likely they
+show the same thing (two channels of one network, Zagoruyko and Komodakis 2015). It learnt that on
+drawn objects (:mod:`qsgm.train.grasp.comparer`) and learns nothing on the device; what it says is
+the strongest piece of evidence that :mod:`qsgm.grasp.decision` weighs. 24,000 weights of 8 bits.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""Whether a candidate is the taught object: many pieces of evidence weighed into one quality.
+"""Whether a candidate is the taught object: few pieces of evidence weighed into one quality.
 
 A small network of one hidden layer, trained on drawn scenes with the object and without it
 (:mod:`qsgm.train.grasp.decision`). Its threshold is set on whole scenes, for a stated rate of false
@@ -18,8 +18,8 @@ from qsgm.grasp.comparer import Comparer
 from qsgm.grasp.evidence import NAMES
 
 Floats = NDArray[np.float32]
-# Of drawn scenes without the object. In photographs up to four times as many were raised.
-FALSE_ALARM_RATE = 0.005
+# Of drawn scenes without the object. In photographs as many are raised (`docs/results.md`).
+FALSE_ALARM_RATE = 0.01
 MOST_HIDDEN = 256
 # Odds this close to the threshold are worth eight looks instead of one.
 _CLOSE = 3.0

@@ -106,7 +106,7 @@ class Finder:
             found = judge(appearance, frame, heatmap, effort)
             evidence = np.stack([one.evidence for one in found])
             seen = np.stack([one.seen for one in found])
-            judged = decision.judged(appearance.reference.cells, evidence, seen)
+            judged = decision.judged(appearance.aligner.cells, evidence, seen)
             for one, quality in zip(found, judged.tolist(), strict=True):
                 sightings.append(
                     Sighting(view, one.fit, one.lead, one.center_px, quality, one.cell_px)

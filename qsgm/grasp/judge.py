@@ -25,7 +25,8 @@ from qsgm.grasp.correlation import (
     pyramid_of,
 )
 from qsgm.grasp.crops import HALF_CROP_PX
-from qsgm.grasp.evidence import Edges, Reference, edges_of, evidence, firmness, reference_of
+from qsgm.grasp.edges import Edges, TaughtEdges
+from qsgm.grasp.evidence import evidence
 from qsgm.grasp.patch import PATCH_PX, Patch
 from qsgm.grasp.snapping import Snapper
 
@@ -80,19 +81,19 @@ class Appearance:
     """What the taught object looks like, made ready for comparison."""
 
     template: Template
-    reference: Reference
     aligner: Aligner
+    edges: TaughtEdges
 
     @staticmethod
     def of(patch: Patch) -> "Appearance":
         template = Template(patch)
         aligner = Aligner.of(template)
-        return Appearance(template, reference_of(aligner.cells), aligner)
+        return Appearance(template, aligner, TaughtEdges.of(aligner.cells))
 
     @cached_property
     def snapper(self) -> Snapper:
         """Made when it is first needed."""
-        return Snapper.of(self.reference)
+        return Snapper.of(self.aligner.cells)
 
     def center_of(self, fit: Fit) -> tuple[float, float]:
         """Where the object's centre (x, y) is in the frame that a fit lies over."""
@@ -131,7 +132,7 @@ class _Pose:
 class _Laid:
     """A pose after it was aligned exactly."""
 
-    reference: Reference
+    taught: TaughtEdges
     pose: _Pose  # before
     fit: Fit
     look: Look
@@ -139,12 +140,12 @@ class _Laid:
     @cached_property
     def edges(self) -> Edges:
         """What the demonstration's edges find there."""
-        return edges_of(self.reference, self.look)
+        return self.taught.met_by(self.look.seen)
 
     @cached_property
     def firmness(self) -> float:
         """How firmly it holds there."""
-        return firmness(self.look, self.edges)
+        return self.edges.firmness(self.look)
 
 
 def judge(
@@ -224,7 +225,7 @@ def _all_aligned(
 
 
 def _aligned(appearance: Appearance, scene: Pyramid, pose: _Pose, start: Fit) -> _Laid:
-    return _Laid(appearance.reference, pose, *appearance.aligner.aligned(scene, start))
+    return _Laid(appearance.edges, pose, *appearance.aligner.aligned(scene, start))
 
 
 def _by_edges(appearance: Appearance, scene: Pyramid, laid: _Laid) -> _Laid:
@@ -243,8 +244,8 @@ def _candidate(
 ) -> Candidate:
     pose = laid.pose
     better, lead = _better_way_round(appearance, scene, laid, others)
-    fit, edges = better.fit, better.edges
-    facts = evidence(appearance.reference, better.look, fit.scale, pose.quality, lead, edges)
+    fit = better.fit
+    facts = evidence(better.look.trusted.correlation, fit.scale, pose.quality, lead)
     center = appearance.center_of(fit)
     cell = cell_center(pose.cell)
     return Candidate(fit, facts, better.look.picture, center, cell, lead, pose.quality)

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsgm.grasp.alignment import as_taught, stepped
-from qsgm.grasp.cells import SIDE
+from qsgm.grasp.cells import SIDE, Cells
 from qsgm.grasp.correlation import Fit, Pyramid
-from qsgm.grasp.evidence import Reference
-from qsgm.grasp.outline import sampled
+from qsgm.grasp.outline import Outline, sampled
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -45,14 +44,14 @@ class Snapper:
     moves: Doubles  # (N, 4): how far outwards each point goes by each kind of step
 
     @staticmethod
-    def of(reference: Reference) -> "Snapper":
+    def of(cells: Cells) -> "Snapper":
         """What a demonstration's outline is looked for by."""
-        outline = reference.outline
+        outline = Outline.of(cells.solid)
         across, below = -outline.inward.astype(np.float64).T
         right, down = (outline.points.astype(np.float64) - (SIDE - 1) / 2).T
         turn, growth = across * down - below * right, across * right + below * down
         moves = np.stack([across, below, turn, growth], axis=1)
-        colours = np.ascontiguousarray(reference.rim_colours.T)[..., None]
+        colours = np.ascontiguousarray(outline.colours_inside(cells.image).T)[..., None]
         return Snapper(outline.lines(_OFFSETS), colours, moves)
 
     def snapped(self, scene: Pyramid, fit: Fit) -> Fit:

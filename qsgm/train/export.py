@@ -144,7 +144,7 @@ def export_bundle(
     if usual:
         texts = {tuned: str(blocks) for tuned, blocks in usual.items()}
         manifest = replace(manifest, usual_blocks=texts)
-    card = model_card(report, checkpoint_path, trainee.checkpoint.card, lessons)
+    card = model_card(report, checkpoint_path, trainee.checkpoint, lessons, task_files)
     files["README.md"] = card.encode()
     with new_folder(output_folder, WEIGHTS) as new:
         for name, data in files.items():

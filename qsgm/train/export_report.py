@@ -1,7 +1,7 @@
 """What exporting found out: as JSON, as a table, and as the bundle's model card."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from qsgm.files import sha256
 from qsgm.sgm.float import FoldedSgm
 from qsgm.sgm.int8 import QuantizedSgm, SgmRanges, constants
 from qsgm.tables import TIGHT, legend, table
+from qsgm.train.checkpoint import Checkpoint
 from qsgm.train.quantization.calibrate import EQUAL_COSINE, Calibration
 from qsgm.train.quantization.lessons import Lessons
 from qsgm.tune.report import fidelity_json
@@ -214,15 +215,20 @@ def markdown(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def model_card(
-    report: ExportReport, checkpoint: Path, made: Mapping[str, Any], lessons: Lessons
+    report: ExportReport,
+    path: Path,
+    checkpoint: Checkpoint,
+    lessons: Lessons,
+    task_files: Iterable[str],
 ) -> str:
     """The bundle's README.md.
 
     Args:
         report: on its export.
-        checkpoint: that it was made from.
-        made: the checkpoint's own card.
+        path: of the checkpoint that it was made from.
+        checkpoint: what that holds.
         lessons: the calibration set.
+        task_files: names of what the task adds to a bundle.
     """
     headers = [" ".join(header.split()) for header in _HEADERS]
     lines = markdown(headers, [one.cells() for one in report.layers.values()])
@@ -231,32 +237,33 @@ def model_card(
     if judged(calibration):
         rows = calibrator_rows(calibration)
         whose += f"\n\n{markdown(calibrator_headers(calibration), rows)}"
-    card = json.dumps(made, indent=1, sort_keys=True)
+    card = json.dumps(checkpoint.card, indent=1, sort_keys=True)
+    depth, task = checkpoint.task.network.depth, checkpoint.task.name
+    added = "".join(f"\n| `{name}` | what the task needs beside them |" for name in task_files)
     bits = {layer.int8_sgm.bits for layer in report.layers.values()}
     planes = "one plane" if bits == {8} else "two planes"
-    return f"""# GraspNet with int8 synthetic gradient modules
+    return f"""# Int8 synthetic gradient modules for the task `{task}`
 
-Standard ONNX graphs for fine-tuning GraspNet on the device, feed-forward; `manifest.json` says what
-is in them. Batchnorm is folded into the convolutions (largest change of any output:
-{report.fold_max_abs_error:.1e}), pixel normalisation into those of the trunks.
+Standard ONNX graphs for fine-tuning the last of {depth} layers on the device, feed-forward;
+`manifest.json` says what is in them. Batchnorm is folded into the convolutions (largest change of
+any output: {report.fold_max_abs_error:.1e}), normalisation of inputs into those of the trunks.
 
 | file | what |
 | --- | --- |
-| `network.onnx` | a frame to its heatmap |
+| `network.onnx` | an input to what the network gives |
 | `weights.bin` | constants of all other graphs, which open with it beside them only |
-| `trunk_P_N.onnx` | crops to u8 features when the last N layers are tuned, the others in P |
+| `trunk_P_N.onnx` | inputs to u8 features when the last N layers are tuned, the others in P |
 | `head_N.onnx` | features to outputs |
 | `step_int8_*_B.onnx`, `step_float_*_B.onnx` | a training step; B: layers in blocks |
-| `step_float_*_A-6.onnx` | one block: the same step by backpropagation, for comparison |
-| `probe_N.onnx` | int8, float and true gradients of a batch, and the updates they lead to |
-| `distractors.png` | drawn things that are put on crops, to tell the object apart from |
+| `step_float_*_A-{depth}.onnx` | one block: the same step by backpropagation, for comparison |
+| `probe_N.onnx` | int8, float and true gradients of a batch, and the updates they lead to |{added}
 
 ## Made from
 
-    qsgm fold-and-quantize {checkpoint.name}
+    qsgm fold-and-quantize {path.name}
 
-- checkpoint: sha256 `{sha256(checkpoint.read_bytes())}`
-- calibration set: {len(lessons)} frames, sha256 of its manifest
+- checkpoint: sha256 `{sha256(path.read_bytes())}`
+- calibration set: {len(lessons)} lessons, sha256
   `{lessons.sha256}`
 
 How the checkpoint was pretrained, and what it scored:
@@ -268,8 +275,8 @@ How the checkpoint was pretrained, and what it scored:
 ## The int8 SGMs
 
 u8 activations of {planes}, s8 weights of two planes, a scale for every channel, int32 sums, float
-gradients out. Measured while the int8 SGMs fine-tuned the last three layers on the calibration
-frames; behind layers 1 to 3, where there are SGMs, on batches along shorter runs of all layers.
+gradients out. Measured on the calibration set while the int8 SGMs fine-tuned the last layers, which
+they were meta-trained on; SGMs of layers further in front on batches along shorter runs of all.
 {LEGEND[0].upper()}{LEGEND[1:]}.
 
 {lines}

@@ -64,7 +64,7 @@ def test_all_cells_together_are_one_weighted_image(seed: int) -> None:
 
 def test_an_image_compared_with_itself_agrees_but_for_the_noise() -> None:
     look = CELLS.look(CELLS.image)
-    np.testing.assert_allclose(look.agreement, CELLS.texture, atol=2e-3)
+    np.testing.assert_allclose(look.agreement, CELLS.variance / CELLS.noisy, atol=2e-3)
     assert look.trust.sum() == pytest.approx(1, abs=1e-5)
     assert look.score <= 1
 

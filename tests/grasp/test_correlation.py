@@ -192,7 +192,7 @@ def test_a_scene_moved_back_by_its_fit_is_the_demonstration() -> None:
     fit = Fit(0, math.radians(turn), scale, center)
     taught = as_taught(pyramid_of(DEMONSTRATION), Fit(0, 0, 1.0, CENTER))
     seen = as_taught(scene, fit)
-    mask = APPEARANCE.reference.inside
+    mask = APPEARANCE.aligner.cells.solid >= 0.5
     assert np.abs(seen - taught)[mask].mean() < 6
     wrong = as_taught(scene, Fit(0, math.radians(turn + 20), scale, center))
     assert np.abs(wrong - taught)[mask].mean() > 15

@@ -128,7 +128,7 @@ def test_looks_decision_and_provenance_read_back_as_they_were(
     assert again.decision is not None
     assert again.decision.to_json() == by_correlation().to_json()
     values = json.loads((tmp_path / "toy" / DESCRIPTION).read_text())
-    assert values["threshold"] == {"quality": 0.5, "false_alarm_rate": 0.005}
+    assert values["threshold"] == {"quality": 0.5, "false_alarm_rate": 0.01}
     assert {path.name for path in (tmp_path / "toy").iterdir()} == {
         "SHA256SUMS",
         "network.onnx",

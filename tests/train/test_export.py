@@ -249,6 +249,9 @@ def test_the_table_and_the_model_card_show_every_layer(
         assert cosine in card
         assert cosine in shown.getvalue()
     assert '"seed": 11' in card
+    assert "for the task `grasp`" in card
+    assert "| `distractors.png` |" in card
+    assert "`step_float_*_A-6.onnx`" in card
 
 
 def test_the_same_checkpoint_gives_the_same_bytes(

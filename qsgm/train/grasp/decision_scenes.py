@@ -108,7 +108,7 @@ def _judge_all(
     number: int, episode: Episode, look: Look, comparer: Comparer | None
 ) -> Iterator[JudgedScene]:
     appearance = Appearance.of(cut_patch(episode.demonstration.image, CENTER_PX))
-    cells = appearance.reference.cells
+    cells = appearance.aligner.cells
 
     def judged(scene: DrawnScene, center_px: tuple[float, float] | None) -> JudgedScene:
         found = judge(appearance, scene.image, look(scene.image))
