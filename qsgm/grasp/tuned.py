@@ -56,7 +56,7 @@ _LEAST_SIDE_PX = 64
 # Where that is asked for, an object that is not found is looked for more closely, and as if it were
 # so many times as large. More looks are more occasions to be wrong: a place has to be surer there.
 OTHER_SIZES = (0.5, 0.7, 1.4, 2.0)
-SURE_MORE_CLOSELY, SURE_AT_OTHER_SIZES = 0.7, 0.9
+SURE_MORE_CLOSELY, SURE_AT_OTHER_SIZES = 0.6, 0.85
 # The network sees larger frames strip by strip: 60 MB are enough then, whatever their size. Up to
 # half as large ones (a camera's 640x480) leave ONNX Runtime's memory to the next frame.
 _STRIP_PIXELS = 1 << 20
