@@ -7,7 +7,7 @@ from toys import lay, table, toy
 from qsgm.grasp.correlation import Fit, pyramid_of
 from qsgm.grasp.edges import Edges
 from qsgm.grasp.judge import Appearance
-from qsgm.grasp.patch import cut_patch
+from qsgm.grasp.patch import Patch, cut_patch
 
 CENTER = (320.0, 240.0)
 APPEARANCE = Appearance.of(cut_patch(lay(toy(), table(), CENTER), CENTER))
@@ -43,3 +43,23 @@ def test_a_thing_that_is_larger_has_no_edge_where_the_object_ends() -> None:
     taught, _ = seen_in(lay(toy(), table(5), CENTER))
     wide, _ = seen_in(lay(plain, table(5), CENTER))
     assert wide.outline < 0.6 * taught.outline
+
+
+@pytest.mark.parametrize("pixel", [(0, 0), (159, 159), (80, 80), None])
+@pytest.mark.parametrize("grey", [0, 255, None])
+def test_any_patch_and_scene_give_finite_edges(
+    pixel: tuple[int, int] | None, grey: int | None
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (160, 160, 3)).astype(np.uint8)
+    mask = np.full((160, 160), 255 if pixel is None else 0, np.uint8)
+    if pixel is not None:
+        mask[pixel] = 255
+    image = noise if grey is None else np.full_like(noise, grey)
+    appearance = Appearance.of(Patch(image, mask))
+    for scene in (np.zeros((300, 330, 3), np.uint8), np.tile(noise, (2, 3, 1))[:300, :330]):
+        look = appearance.aligner.look(pyramid_of(scene), Fit(0.0, 0.3, 1.0, (150.0, 150.0)))
+        edges = appearance.edges.met_by(look.seen)
+        assert np.isfinite([edges.agreement, edges.outline, edges.firmness(look)]).all()
+        assert -1 <= edges.agreement <= 1 + 1e-6
+        assert 0 <= edges.outline <= 1 + 1e-6
